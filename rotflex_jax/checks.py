@@ -1,4 +1,4 @@
-"""Checks of arguments at the edge of the API: what makes no sense is refused with one sentence."""
+"""Checks of arguments of the public functions; an invalid argument is refused with one sentence."""
 
 import math
 from collections.abc import Callable, Iterable, Mapping
@@ -11,7 +11,7 @@ from rotflex_jax.errors import InputError
 
 
 def shown(value: Any) -> str:
-    """What was given, short enough for a sentence.
+    """The given value as text, short enough for a sentence.
 
     >>> shown(np.float64(0.5)), shown("run.csv"), shown([1, 2, 3]), shown(int)
     ('0.5', "'run.csv'", 'a list', 'the class int')
@@ -28,7 +28,7 @@ def shown(value: Any) -> str:
 
 
 def real(value: Any) -> float:
-    """A real number as a float; nan for anything else, also for True and False."""
+    """A real number as a float; NaN for anything else, also for True and False."""
     try:
         array = np.asarray(value)
         if array.ndim or array.dtype.kind not in "iuf":
@@ -39,7 +39,7 @@ def real(value: Any) -> float:
 
 
 SMALLEST, LARGEST = 1e-100, 1e100
-"""Numbers beyond these are no quantity of anything; products of them overflow."""
+"""Range of accepted numbers; no physical quantity is beyond it, and products of larger ones can overflow."""
 
 
 def number(
@@ -55,16 +55,16 @@ def number(
     """A finite number within limits.
 
     Args:
-        value: What was given.
-        name: Of the argument.
-        above: It must be larger.
-        least: It must not be smaller.
-        below: It must be smaller.
-        unit: In words or as a symbol.
-        example: What the sentence offers.
+        value: The value that was given.
+        name: Name of the argument.
+        above: The number must be larger than this.
+        least: The number must not be smaller than this.
+        below: The number must be smaller than this.
+        unit: Unit in words or as a symbol.
+        example: Valid value that the message suggests.
 
     Raises:
-        InputError: It is none.
+        InputError: The value is no such number.
 
     >>> number(float("nan"), "seconds", above=0, unit="s", example="2.0")
     Traceback (most recent call last):
@@ -89,7 +89,7 @@ def positive(value: Any, name: str, unit: str = "s", example: str = "2.0") -> fl
 
 
 LARGEST_COUNT = 2**31 - 1
-"""Of anything that is counted."""
+"""Largest whole number that is accepted as a count."""
 
 
 def whole(value: Any, name: str, least: int, most: float = LARGEST_COUNT) -> int:
@@ -112,16 +112,16 @@ give for instance 1.
 
 
 def vector(values: Any, name: str, count: int | None = None, *, example: str) -> Float[np.ndarray, " N"]:
-    """Finite real numbers in a row.
+    """A vector of finite real numbers.
 
     Args:
-        values: What was given.
-        name: Of the argument.
-        count: How many there must be; any number of them for None.
-        example: What the sentence offers.
+        values: The values that were given.
+        name: Name of the argument.
+        count: Required number of entries; None for any number.
+        example: Valid value that the message suggests.
 
     Raises:
-        InputError: They are none.
+        InputError: The values are no such vector.
     """
     try:
         found = np.asarray(values)
@@ -138,13 +138,13 @@ def vector(values: Any, name: str, count: int | None = None, *, example: str) ->
 
 
 def instance(value: Any, kind: type, name: str, hint: str) -> None:
-    """Refuses what is not of a class of this package; `hint` says where to get one."""
+    """Refuses a value that is no instance of `kind`; `hint` states how to get one."""
     if not isinstance(value, kind):
         raise InputError(f"Argument `{name}` must be a {kind.__name__}, but is {shown(value)}; {hint}.")
 
 
 def one_of(value: Any, name: str, choices: Iterable[str]) -> str:
-    """A word among others."""
+    """A word, which must be one of the choices."""
     listed = tuple(choices)
     if isinstance(value, str) and value in listed:
         return value
@@ -155,14 +155,14 @@ def one_of(value: Any, name: str, choices: Iterable[str]) -> str:
 
 
 def yes_or_no(value: Any, name: str) -> bool:
-    """True or False; nothing else that may be taken for one of them."""
+    """True or False; values that only count as true or false are refused."""
     if isinstance(value, bool | np.bool_):
         return bool(value)
     raise InputError(f"Argument `{name}` must be True or False, but is {shown(value)}; give one of them.")
 
 
 def entries(value: Any) -> tuple[Any, ...] | None:
-    """What a sequence holds; None for a text, for names with values and for what is no sequence."""
+    """The entries of a sequence; None for a text, for a mapping and for a value that is no sequence."""
     if isinstance(value, str | bytes | Mapping):
         return None
     try:
@@ -172,7 +172,7 @@ def entries(value: Any) -> tuple[Any, ...] | None:
 
 
 def names(value: Any, name: str) -> tuple[str, ...]:
-    """Several names in a sequence; one alone is none of these, as its letters would count."""
+    """Several names in a sequence; a single text is refused, because its letters would count as names."""
     listed = entries(value)
     if listed is not None and all(isinstance(entry, str) for entry in listed):
         return listed
@@ -181,7 +181,7 @@ def names(value: Any, name: str) -> tuple[str, ...]:
 
 
 def progress(given: Any) -> Callable[[str], Any]:
-    """A function that takes lines of progress; one that does nothing for None."""
+    """The function that receives lines of progress; for None, a function that does nothing."""
     if given is None:
         return lambda _: None
     if callable(given):
@@ -193,15 +193,15 @@ def progress(given: Any) -> Callable[[str], Any]:
 
 
 def seed(value: Any) -> Any:
-    """A whole number from 0, or a generator of NumPy."""
+    """A seed: a whole number from 0, or a generator of NumPy."""
     return value if isinstance(value, np.random.Generator) else whole(value, "seed", 0, math.inf)
 
 
 def signal(u: Any, name: str = "u") -> Float[np.ndarray, " N"]:
-    """A signal as an array, float32 where that was given, else float64.
+    """A signal as an array: float32 if it was given in single or half precision, else float64.
 
     Raises:
-        InputError: More than one column, complex, empty, or not finite.
+        InputError: The signal has more than one column, is complex or empty, or is not finite.
     """
     try:
         array = np.asarray(u)
@@ -222,6 +222,6 @@ def signal(u: Any, name: str = "u") -> Float[np.ndarray, " N"]:
 
 
 def all_finite(x: Num[np.ndarray, "..."]) -> bool:
-    """Whether all numbers are finite, mostly without an array of results."""
+    """Whether all numbers are finite; usually needs no array of results."""
     with np.errstate(all="ignore"):
         return bool(np.isfinite(np.sum(x)) or np.isfinite(x).all())

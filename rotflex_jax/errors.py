@@ -21,7 +21,7 @@ def optional(module: str, purpose: str) -> ModuleType:
 
     Args:
         module: name of the module.
-        purpose: what the user wanted; the first words of the error.
+        purpose: what the user wanted to do; the first words of the message.
 
     Returns:
         The imported module.
@@ -46,7 +46,7 @@ which is not installed; install it with `pip install "rotflex_jax[all]"`.
 
 
 def _extra_with(package: str) -> str:
-    """The first extra of this package that brings another one, but for "dev"; "all" where none does."""
+    """The first extra, other than "dev", that installs the optional package; "all" if there is none."""
     try:
         lines = importlib.metadata.requires("rotflex_jax") or []
     except importlib.metadata.PackageNotFoundError:  # run from a folder

@@ -1,7 +1,7 @@
-"""Errors of a model, per channel, after the samples that it may see.
+"""Errors of a model for each channel, without the first samples, which the model may use.
 
-Every metric takes either a recording and the output of a model, and gives one number per channel name, or
-two arrays, time first, and gives one number per column.
+Every metric takes either a recording and the output of a model, and returns one number for each channel name;
+or two arrays, with time as the first axis, and returns one number for each column.
 
 >>> import numpy as np
 >>> y = np.array([[0.0, 0.0], [1.0, 2.0], [2.0, 4.0]])
@@ -21,7 +21,7 @@ from rotflex_jax.errors import InputError
 
 @runtime_checkable
 class Measured(Protocol):
-    """What a metric needs of a recording."""
+    """The part of a recording that a metric needs."""
 
     @property
     def y(self) -> Real[np.ndarray, "N C"]: ...  # noqa: D102
@@ -33,7 +33,7 @@ class Measured(Protocol):
 
 @runtime_checkable
 class Sampled(Protocol):
-    """What the layout of windows depends on."""
+    """The part of a recording on which the layout of windows depends."""
 
     @property
     def N(self) -> int: ...  # noqa: D102
@@ -44,7 +44,7 @@ class Sampled(Protocol):
 
 
 Outputs = Real[Any, "N *C"] | Sequence[Any]
-"""An array of NumPy or JAX, time first, or a list."""
+"""An array of NumPy or JAX with time as the first axis, or a list."""
 
 
 def _score(
@@ -81,7 +81,7 @@ def _score(
 
 
 def _ratio(part: Any, whole: Any) -> Any:
-    """The quotient, not a number where the whole is nothing: a channel at rest has no fit."""
+    """The quotient; NaN if the denominator is zero: a channel at rest has no fit."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(whole > 0, part / whole, np.nan)[()]
 
@@ -102,10 +102,11 @@ def rmse(y: Measured | Outputs, y_hat: Outputs, n_init: int | None = None) -> An
     Args:
         y: Recording, or measured output (N,) or (N, C) [unit of the channel].
         y_hat: modelled output, same shape.
-        n_init: samples at the start that are not scored; the recording's own, or 0 for arrays.
+        n_init: number of samples at the start that are not scored; by default `n_init` of the recording, or 0
+            for arrays.
 
     Returns:
-        Channel name to value for a recording, else one value per column [unit of the channel].
+        Channel name -> value for a recording, else one value for each column [unit of the channel].
 
     Raises:
         InputError: the shapes differ, or no sample is left to score.
@@ -121,7 +122,7 @@ def nrmse(y: Measured | Outputs, y_hat: Outputs, n_init: int | None = None) -> A
 
     nrmse = norm(e) / norm(y - mean(y))
 
-    0 is perfect, 1 is as good as the mean. Not for a channel at rest: it is not a number there.
+    0 is perfect, 1 is as good as the mean. Not for a channel at rest, where it is NaN.
     Args, Returns, Raises as `rmse`.
 
     >>> float(nrmse([0.0, 1.0, 2.0], [1.0, 1.0, 1.0]))
@@ -135,7 +136,7 @@ def fit_percent(y: Measured | Outputs, y_hat: Outputs, n_init: int | None = None
 
     fit = 100 (1 - norm(e) / norm(y - mean(y)))
 
-    Negative for a model worse than the mean. Not for a channel at rest: it is not a number there.
+    Negative for a model worse than the mean. Not for a channel at rest, where it is NaN.
     Args, Returns, Raises as `rmse`.
 
     >>> float(fit_percent([0.0, 1.0, 2.0], [0.0, 1.0, 2.0]))
@@ -149,7 +150,7 @@ def vaf(y: Measured | Outputs, y_hat: Outputs, n_init: int | None = None) -> Any
 
     vaf = 100 (1 - var(e) / var(y))
 
-    Not where an offset matters: it does not see one, `fit_percent` does.
+    Not for cases in which an offset matters: it ignores an offset, `fit_percent` does not.
     Args, Returns, Raises as `rmse`.
 
     >>> float(vaf([0.0, 1.0, 2.0], [5.0, 6.0, 7.0]))
@@ -189,12 +190,12 @@ def max_error(y: Measured | Outputs, y_hat: Outputs, n_init: int | None = None) 
 
 
 def window_starts(recording: Sampled, seconds: float) -> tuple[Int[np.ndarray, " W"], int]:
-    """First samples of the windows of a recording, and the longest window's length [samples].
+    """First samples of the windows of a recording, and the length of the longest window [samples].
 
     Args:
-        recording: What is cut.
-        seconds: Length of a window [s], twice `n_init` at least; a rest no longer than that joins the
-            last.
+        recording: Recording that is divided.
+        seconds: Length of a window [s], at least twice `n_init`; a remainder of up to twice `n_init` belongs
+            to the last window.
     """
     N, m, seconds = recording.N, recording.n_init, positive(seconds, "seconds")
     width = min(N, max(round(min(seconds / recording.Ts, N)), 2 * m))
@@ -203,7 +204,7 @@ def window_starts(recording: Sampled, seconds: float) -> tuple[Int[np.ndarray, "
 
 
 def counted(recording: Sampled, seconds: float) -> Bool[np.ndarray, " N"]:
-    """Which samples count in an error over windows: not the first `n_init` of each, which a run may see."""
+    """Which samples count in an error over windows: all but the first `n_init` of each window."""
     starts, _ = window_starts(recording, seconds)
     counts = np.ones(recording.N, bool)
     counts[(starts[:, None] + np.arange(recording.n_init)).ravel()] = False
@@ -216,19 +217,19 @@ def windowed_rmse(
     simulated: Sequence[Real[np.ndarray, "_ C"]],
     seconds: float,
 ) -> Real[np.ndarray, " C"]:
-    """Root mean square error of free runs that start again every few seconds, over all recordings together.
+    """Root mean square error of free runs over windows, over all recordings together.
 
-    A run is that of `simulate_windows` of a model: every window starts at its own positions and speeds, but
-    with the voltage that came before it.
+    The runs are those of `simulate_windows` of a model: each window starts at its own positions and speeds,
+    but with the voltage before it.
 
     Args:
-        recordings: They determine the windows.
-        measured: Their outputs, in the order of the model [unit of the channel].
-        simulated: The runs, same shapes.
+        recordings: Recordings, which determine the windows.
+        measured: Outputs of the recordings, in the order of the model [unit of the channel].
+        simulated: Simulated outputs, of the same shapes.
         seconds: Length of the windows [s].
 
     Returns:
-        One value per column [unit of the channel].
+        One value for each column [unit of the channel].
     """
     total, count = 0.0, 0
     for recording, y, y_hat in zip(recordings, measured, simulated, strict=True):

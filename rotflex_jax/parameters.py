@@ -1,7 +1,7 @@
 """Parameters: numbers with a unit, bounds and a typical size, and the coordinates in which they are fitted.
 
-An effect declares its parameters with `parameter(...)`; a fit varies unconstrained coordinates `z`, and
-`Transform` maps them to physical values, so that no bound is ever crossed.
+An effect declares its parameters with `parameter(...)`. A fit varies unconstrained coordinates `z`, and
+`Transform` maps them to physical values, so that no bound is ever violated.
 """
 
 import dataclasses
@@ -16,10 +16,10 @@ import numpy as np
 import scipy
 from jaxtyping import Array, Bool, Float, Real
 
-# Trusted constants that are named beside an interval; of more only their number is said.
+# Largest number of trusted constants that are named with an interval; others are only counted.
 _NAMED_CONSTANTS = 3
 HALF_WIDTH_95 = 1.96
-"""Half of the 95 % interval of a normal number, in its standard deviations."""
+"""Half width of the 95 % interval of a normal distribution, in standard deviations."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,12 +27,12 @@ class Specification:
     """Declares one parameter of an effect.
 
     Attributes:
-        unit: SI unit as people write it, "" where there is none.
-        typical: Usual size [unit]; sets the scale of a fit.
-        lower: Values below are impossible [unit].
-        upper: Values above are impossible [unit].
-        physical: Range [unit] a healthy machine lies in; an estimate outside is flagged, not forbidden.
-        meaning: A phrase for tables.
+        unit: SI unit as it is usually written; "" for a number without a unit.
+        typical: Typical size [unit]; sets the scale of a fit.
+        lower: Lower bound; values below are impossible [unit].
+        upper: Upper bound; values above are impossible [unit].
+        physical: Range of healthy machines [unit]; an estimate outside is flagged, not forbidden.
+        meaning: Phrase for tables.
     """
 
     unit: str
@@ -44,7 +44,7 @@ class Specification:
 
 
 def parameter(default: float | None, **declared: Any) -> Any:
-    """A dataclass field that is a parameter; keywords as in `Specification`."""
+    """A dataclass field that declares a parameter; keywords as in `Specification`."""
     declared.setdefault("typical", abs(default) if default else 1.0)
     return dataclasses.field(default=default, metadata={"parameter": Specification(**declared)})
 
@@ -52,8 +52,8 @@ def parameter(default: float | None, **declared: Any) -> Any:
 def specifications(owner: Any) -> dict[str, Specification]:
     """Name -> `Specification` of every parameter of a dataclass (class or instance), in order.
 
-    A parameter whose value is None belongs to a part that the instance lacks and is left out. An instance
-    whose number of parameters depends on its shape has a method `own_specifications`.
+    A parameter whose value is None belongs to a part that the instance does not have; it is left out. An
+    instance whose number of parameters depends on its shape has a method `own_specifications`.
     """
     own = getattr(owner, "own_specifications", None)
     if own and not isinstance(owner, type):
@@ -70,10 +70,10 @@ def _declared(owner: type) -> dict[str, Specification]:
 
 @dataclasses.dataclass(frozen=True)
 class Transform:
-    """Unconstrained `z` <-> physical `p`, elementwise, by the bounds of each parameter.
+    """Transform between unconstrained `z` and physical `p`, elementwise, by the bounds of each parameter.
 
     With a lower bound `p = lower + exp(z)`, with an upper bound `p = upper - exp(z)`, with both a logistic
-    curve, without bounds `p = typical z`. A step of one in `z` is always a sizeable step in `p`.
+    curve, without bounds `p = typical z`. A step of one in `z` is always a substantial step in `p`.
     """
 
     lower: Float[np.ndarray, " P"]
@@ -91,7 +91,7 @@ class Transform:
     ) -> tuple[
         Bool[np.ndarray, " P"], Bool[np.ndarray, " P"], Float[np.ndarray, " P"], Float[np.ndarray, " P"]
     ]:
-        """Which have one bound, which have two, the bound (of two the lower), and the direction inwards."""
+        """Which parameters have one bound, which have two, the bound (the lower of two), the sign inwards."""
         low, high = np.isfinite(self.lower), np.isfinite(self.upper)
         edge = np.where(low, self.lower, np.where(high, self.upper, 0.0))
         return low != high, low & high, edge, np.where(low, 1.0, -1.0)
@@ -101,7 +101,7 @@ class Transform:
         single, boxed, edge, way = self._kinds()
         low, sign = jnp.asarray(edge, z.dtype), jnp.asarray(way, z.dtype)
         span = jnp.asarray(np.where(boxed, self.upper - self.lower, 1.0), z.dtype)
-        # The exponent is capped where it would overflow: a rejected trial step may ask for anything.
+        # The exponent is capped against overflow: a trial step that is refused may have any size.
         grown = jnp.exp(jnp.minimum(jnp.where(jnp.asarray(single), z, 0.0), 60.0))
         p = jnp.where(jnp.asarray(single), low + sign * grown, z * jnp.asarray(self.typical, z.dtype))
         return jnp.where(jnp.asarray(boxed), low + span * jax.nn.sigmoid(z), p)
@@ -109,7 +109,7 @@ class Transform:
     def physical(
         self, z: Float[np.ndarray, "*batch P"]
     ) -> tuple[Float[np.ndarray, "*batch P"], Float[np.ndarray, "*batch P"]]:
-        """Outside traced code: `constrain(z)` and its derivative."""
+        """`constrain(z)` and its derivative, outside of traced code."""
         single, boxed, edge, way = self._kinds()
         span = np.where(boxed, self.upper - self.lower, 1.0)
         grown = way * np.exp(np.minimum(np.where(single, z, 0.0), 60.0))
@@ -131,7 +131,7 @@ class Transform:
 
 
 def bound_reached(value: float, spec: Specification, std: float = math.nan) -> str:
-    """The bound that a value is at, in words: by its number, or near it with an interval that goes beyond."""
+    """The bound that a value has reached, in words: at the bound, or the interval includes the bound."""
     for room, which in ((value - spec.lower, "lower"), (spec.upper - value, "upper")):
         near = room < 1e-2 * spec.typical and (math.isnan(std) or room <= HALF_WIDTH_95 * std)
         if math.isfinite(room) and (room < 1e-6 * spec.typical or near):
@@ -143,10 +143,10 @@ class HeldConstant(NamedTuple):
     """A trusted constant on which an estimate depends.
 
     Attributes:
-        name: Its full name.
-        value: What it was held at [unit].
+        name: Full name of the constant.
+        value: Value at which it was held [unit].
         unit: SI unit.
-        change: What the estimate gains where the constant is one per cent larger [unit of the estimate].
+        change: Change of the estimate if the constant is one per cent larger [unit of the estimate].
     """
 
     name: str
@@ -162,13 +162,13 @@ class Estimate:
     Attributes:
         name: Full name, `port.effect.parameter`.
         value: Estimate [unit].
-        std: Standard deviation [unit], robust to correlated residuals; nan for a held constant.
+        std: Standard deviation [unit], robust to correlated residuals; NaN for a held constant.
         ci95: 95 % interval [unit].
         unit: SI unit.
-        free: False where the value was trusted and held.
-        note: What a reader must know, for instance that the estimate is not physical.
+        free: False if the value was trusted and held.
+        note: Information for the reader, for instance that the estimate is outside its physical range.
         given: Trusted constants whose usual tolerance moves the estimate out of its interval, the strongest
-            first: the interval holds only as far as these are right.
+            first: the interval holds only if these are right.
     """
 
     name: str
@@ -182,12 +182,12 @@ class Estimate:
 
     @property
     def remark(self) -> str:
-        """Its note, and the trusted constants on which its interval depends, in words."""
+        """The note, and the trusted constants on which the interval depends, in words."""
         return "; ".join(filter(None, (self.note, self.given_words)))
 
     @property
     def given_words(self) -> str:
-        """The trusted constants on which its interval depends, in words; empty where there are none."""
+        """The trusted constants on which the interval depends, in words; empty if there are none."""
         if not self.given:
             return ""
         named = [f"{c.name} {c.value:.4g} {c.unit}".rstrip() for c in self.given[:_NAMED_CONSTANTS]]
@@ -213,9 +213,9 @@ class Estimate:
 
     @property
     def decimals(self) -> tuple[int, int] | None:
-        """Decimals that show two digits of the interval's half width, and the power of ten behind them.
+        """Number of decimals that show two digits of the half width of the interval, and the power of ten.
 
-        None where there is no interval.
+        None if there is no interval.
 
         >>> Estimate("a", 1.20012, 2e-5, (1.20008, 1.20016), "N m").decimals
         (6, 0)
@@ -229,7 +229,7 @@ class Estimate:
 
     @property
     def texts(self) -> tuple[str, str, str]:
-        """Value and ends of the interval in plain characters, with as many digits as the interval is worth.
+        """Value and ends of the interval as plain text, with as many digits as the interval justifies.
 
         >>> Estimate("a", 0.0300069, 1e-5, (0.029987, 0.030027), "N m").texts
         ('0.030007', '0.029987', '0.030027')
@@ -246,7 +246,7 @@ class Estimate:
         return a, b, c
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain JSON types; `given` only where the interval depends on trusted constants."""
+        """Plain JSON types; with `given` only if the interval depends on trusted constants."""
         return {
             "value": self.value,
             "std": None if math.isnan(self.std) else self.std,

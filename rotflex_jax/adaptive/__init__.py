@@ -1,7 +1,7 @@
 """Adaptive filters: weights that are corrected after every sample.
 
-Beside the filters stand the theory of the simplest of them, LMS (`Moments`, `analyse`, bounds and
-learning curves), and the search for settings by gradient (`tune`) or on a grid (`grid`).
+The package also contains the theory of the simplest filter, LMS (`Moments`, `analyse`, bounds and learning
+curves), and searches for settings of filters by gradient (`tune`) or on a grid (`grid`).
 """
 
 from rotflex_jax.adaptive.filter import AdaptiveFilter, scan

@@ -1,7 +1,7 @@
-"""Quicker forms of LMS and RLS over a Volterra series; all give the same errors to rounding.
+"""Faster forms of LMS and RLS over a Volterra series; all give the same errors to rounding.
 
-Stored regressors take P numbers per sample, and reading them takes longer than forming them. A form has
-a loop state of its own: `begin` makes it from the filter's state, `end` converts it back.
+Stored regressors need P numbers per sample, and reading them takes longer than computing them. A form has its
+own loop state: `begin` makes it from the state of the filter, `end` converts it back.
 """
 
 import dataclasses
@@ -21,17 +21,17 @@ from rotflex_jax.basis import Basis, Delays, Volterra
 from rotflex_jax.basis.volterra import counts, indices, positions
 
 BlockStep = Callable[[Any, tuple[Float[Array, " B"], Float[Array, " B"]]], tuple[Any, Float[Array, " B"]]]
-"""From state and block (input, output) to the next state and the errors of the block."""
+"""Function of state and block (input, output) that returns the next state and the errors of the block."""
 
 
 @dataclasses.dataclass(frozen=True)
 class RegressorsInLoop:
-    """Any filter, on products of delays that are formed sample by sample.
+    """Form of any filter with regressors that are products of delays and are computed sample by sample.
 
     Attributes:
-        memory: delays M.
-        degrees: of the products, 0 for the constant.
-        layout: of the products.
+        memory: number of delays M.
+        degrees: degrees of the products, 0 for the constant.
+        layout: layout of the products.
     """
 
     memory: int
@@ -84,11 +84,11 @@ def scan_blocks(
     """A loop over blocks of samples; the samples that are left form one shorter block.
 
     Args:
-        step: of the loop.
+        step: step of the loop.
         carry: first state.
         x: input.
         y: output.
-        length: samples of a block.
+        length: number of samples in a block.
 
     Returns:
         Last state, and errors.
@@ -120,11 +120,11 @@ class MatrixLMS(RegressorsInLoop):
 
         y_hat = w_0 + (w_1 + W z)'z,    W <- W + H e z z',    H: step sizes, those off the diagonal halved
 
-    No product is formed. Of two samples the second does not wait for the weights after the first:
+    No product of delays is computed. The second of two samples does not need the weights after the first:
 
         e_2 = y_2 - y_hat_2(w) - g e_1,    g = phi_1' diag(mu) phi_2 = mu_0 + (mu_1 + H b)'b,   b = z_1 z_2
 
-    This is exact: g e_1 is the change of the second prediction by the first correction. The weights are
+    This is exact, since g e_1 is the change of the second prediction by the first correction. The weights are
     read and written half as often, and a processor works on two samples at once.
 
     Attributes:
@@ -195,7 +195,8 @@ class MatrixLMS(RegressorsInLoop):
 
 
 LMS_BLOCK_SAMPLES = 32
-"""Samples of a block: enough for efficient matrix products, few enough for a cheap triangular system."""
+"""Number of samples in a block: enough for efficient matrix products, few enough for a cheap triangular
+system."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -255,7 +256,7 @@ Triangle = list[list[Array]]
 
 
 def block_samples(P: int) -> int:
-    """Samples of a block for P weights.
+    """Number of samples in a block of `BlockRLS` for P weights.
 
     >>> [block_samples(P) for P in (21, 66, 231)]
     [4, 2, 16]
@@ -354,16 +355,17 @@ def _solved(L: Triangle, b: list[Array]) -> list[Array]:
 
 
 LEAST_DELAYS_FOR_BLOCKS = 40
-"""Delays from which LMS is quicker in long blocks of samples than in pairs."""
+"""Number of delays from which LMS is faster in long blocks of samples than in pairs."""
 
 
 def fastest_form(filter: AdaptiveFilter, basis: Basis, whole: bool) -> RegressorsInLoop | None:
-    """The form for a filter and a basis; None where regressors have to be formed before the loop.
+    """The fastest form for a filter and a basis; None if the regressors must be computed before the loop.
 
     Args:
-        filter: with settings that are not traced: some forms need equal step sizes within a degree.
-        basis: of the regressors.
-        whole: whether the run is not interrupted; long blocks do not pay where weights are stored often.
+        filter: filter whose settings are not traced, since some forms need equal step sizes within a degree.
+        basis: basis that gives the regressors.
+        whole: whether the run stores the last weights only; long blocks are not faster if weights are stored
+            often.
     """
     if not (isinstance(basis, Volterra) and isinstance(basis.bank, Delays)):
         return None

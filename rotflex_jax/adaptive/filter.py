@@ -1,4 +1,4 @@
-"""What an adaptive filter is, what it is given, and the one loop that runs any of them."""
+"""Base class of adaptive filters, checks of their arguments, and the loop that runs any filter."""
 
 import abc
 from typing import Any, ClassVar, NamedTuple, TypeVar
@@ -15,11 +15,11 @@ from rotflex_jax.errors import InputError
 
 
 def tree_sum(p: Inexact[Array, "P *batch"]) -> Inexact[Array, "*batch"]:
-    """Sum over the first axis, by halves.
+    """Pairwise sum over the first axis.
 
-    In a sum term by term every addition waits for the one before, which for some twenty weights takes longer
-    than all the rest of a filter's step; by halves there are log2(P) additions in a row. The rounding error
-    is smaller, too.
+    In a sum term by term every addition waits for the previous one, which for about twenty weights takes
+    longer than the rest of a filter's step. A pairwise sum has log2(P) additions in a row, and its rounding
+    error is smaller.
 
     Source: Higham 1993, SIAM J. Sci. Comput. 14, section 3 (pairwise summation).
 
@@ -38,23 +38,23 @@ def times(a: Inexact[Array, "..."], b: Inexact[Array, "..."]) -> Inexact[Array, 
     return jnp.matmul(a, b, precision=jax.lax.Precision.HIGHEST)
 
 
-# A setting of a filter: one value, or one for each weight; batched where filters are (`vmap`).
+# A setting of a filter: one value, or one for each weight, with further axes in a batch of filters (`vmap`).
 Number = float | Float[Array, "..."] | Float[np.ndarray, "..."]
 PerWeight = Number
 
 
 def within(name: str, value: Any, low: float, high: float, *, open_low: bool = False) -> None:
-    """Refuses a setting out of its range; a value that JAX only traces is let through.
+    """Refuses a setting out of its range; a value that is traced by JAX is not checked.
 
     Args:
-        name: of the argument.
-        value: a number or an array of them.
+        name: name of the argument.
+        value: a number or an array of numbers.
         low: smallest value.
         high: largest value, which may be infinite.
-        open_low: whether `low` itself is out.
+        open_low: whether `low` itself is excluded.
 
     Raises:
-        InputError: with the offending value and the range.
+        InputError: the value is out of the range.
 
     >>> within("lam", 1.2, 0, 1, open_low=True)
     Traceback (most recent call last):
@@ -81,20 +81,20 @@ choose a value in this range.
 
 
 def count(name: str, value: Any) -> None:
-    """Refuses what is not a whole number from 1.
+    """Refuses a value that is not a whole number of at least 1.
 
     Raises:
-        InputError: with what was given.
+        InputError: the value is not a whole number, or is below 1.
     """
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
         raise InputError(f"Argument `{name}` must be a whole number from 1, but is {value!r}; give one.")
 
 
 def real_data(filter: str, dtype: Any) -> None:
-    """Refuses complex data for a filter that is not made for them.
+    """Refuses complex data for a filter that is defined for real data only.
 
     Raises:
-        InputError: with the name of the filter.
+        InputError: the data are complex.
     """
     if np.issubdtype(dtype, np.complexfloating):
         raise InputError(
@@ -107,13 +107,13 @@ def per_weight(name: str, value: Any, size: int, dtype: Any) -> Inexact[Array, "
     """A setting as one value per weight.
 
     Args:
-        name: of the argument.
+        name: name of the argument.
         value: one number, or one per weight.
         size: number of weights.
-        dtype: of the data.
+        dtype: dtype of the data.
 
     Raises:
-        InputError: neither one number nor one per weight.
+        InputError: the value is neither one number nor one number per weight.
     """
     array = jnp.asarray(value).astype(dtype)
     if array.shape not in ((), (size,)):
@@ -134,8 +134,8 @@ class AdaptiveFilter(eqx.Module):
     """A rule that corrects the weights of `y_hat = w phi` after every sample.
 
     A filter is a pytree whose settings (step sizes, forgetting factors) are leaves: they may be traced,
-    batched with `vmap` and differentiated, and new values compile nothing new. What decides the shape
-    of its state (a window, a memory) is static.
+    batched with `vmap` and differentiated, and new values need no compilation. Settings that determine the
+    shape of the state (a window, a memory) are static.
     """
 
     # Whether `phi` is the input (N,), from which the filter forms its regressors itself.
@@ -149,7 +149,7 @@ class AdaptiveFilter(eqx.Module):
     def step(
         self, state: Any, phi: Inexact[Array, "*P"], y: Inexact[Array, ""]
     ) -> tuple[Any, Inexact[Array, ""]]:
-        """The state after a sample, and its a-priori error `e = y - w phi`, with the weights before it."""
+        """The state after a sample, and the a-priori error `e = y - w phi` with the weights before it."""
 
     def weights(self, state: Any) -> Inexact[Array, " P"]:
         """Weights of a state."""
@@ -168,17 +168,17 @@ def in_dtype(filter: F, dtype: Any) -> F:
 def scan(
     filter: AdaptiveFilter, phi: Inexact[Array, "N *P"], y: Inexact[Array, " N"], state: Any = None
 ) -> tuple[Any, Inexact[Array, " N"]]:
-    """The bare loop in JAX: final state and a-priori errors.
+    """The loop over samples alone, in JAX: final state and a-priori errors.
 
-    Made to be transformed: `vmap` it over filters with batched settings, differentiate it with `jvp`
-    or `jacfwd`. Forward mode is the right one, as settings are few and samples many. It does not look
-    for divergence; errors then grow to infinity. For one run on arrays use `run`.
+    It is made for transformations: apply `vmap` over filters with batched settings, or differentiate it with
+    `jvp` or `jacfwd`. Forward mode is preferable, since there are few settings and many samples. Divergence
+    is not detected, and errors then grow to infinity. For one run on arrays use `run`.
 
     Args:
-        filter: its settings may be traced.
-        phi: regressors (N, P), or the input (N,) for a filter that forms its own.
+        filter: filter whose settings may be traced.
+        phi: regressors (N, P), or the input (N,) for a filter that makes its own regressors.
         y: measured output, of the dtype of `phi`.
-        state: where to go on from; the filter's start if None.
+        state: state with which the loop starts; the filter's initial state if None.
     """
     phi, y = jnp.asarray(phi), jnp.asarray(y)
     filter = in_dtype(filter, phi.dtype)
@@ -188,14 +188,14 @@ def scan(
 
 
 def regressor_size(phi: Inexact[Array, "N *P"] | Inexact[np.ndarray, "N *P"]) -> int:
-    """Regressors per sample."""
+    """Number of regressors per sample."""
     return phi.shape[1] if phi.ndim == 2 else 1
 
 
 def as_samples(
     filter: AdaptiveFilter, phi: Any, y: Any
 ) -> tuple[Inexact[np.ndarray, "N *P"], Inexact[np.ndarray, " N"]]:
-    """Both as finite arrays of one floating dtype."""
+    """`phi` and `y` as finite arrays of one floating dtype, with checked shapes."""
     phi, y = np.asarray(phi), np.asarray(y)
     dimensions, wanted, advice = (
         (1, "(N,)", "the input itself") if filter.from_input else (2, "(N, P)", "a row of regressors")
@@ -211,7 +211,7 @@ def as_samples(
 def finite(
     phi: Shaped[np.ndarray, "N *P"], y: Shaped[np.ndarray, " N"]
 ) -> tuple[Inexact[np.ndarray, "N *P"], Inexact[np.ndarray, " N"]]:
-    """Both in the higher of their precisions, if they are finite."""
+    """`phi` and `y` in the higher of their precisions, after a check that they are finite."""
     named = (("phi", phi), ("y", y))
     for name, x in named:
         if x.dtype.kind not in "iufc":
@@ -229,7 +229,7 @@ def finite(
 
 
 def stretch(u: Real[np.ndarray, " N"], start: int, stop: int) -> Real[np.ndarray, " {stop-start}"]:
-    """Part of an input, zero before its first sample; not copied where it lies inside."""
+    """Part of an input, with zeros before its first sample; not copied if it lies inside the input."""
     part = u[max(0, start) : max(0, stop)]
     missing = stop - start - len(part)
     return np.concatenate([np.zeros(missing, u.dtype), part]) if missing else part

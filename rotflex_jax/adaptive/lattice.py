@@ -1,4 +1,4 @@
-"""Recursive least squares for a second-order Volterra filter, stage by stage of its memory."""
+"""Recursive least squares for a second-order Volterra filter, in one stage for each sample of memory."""
 
 from typing import Any, ClassVar, NamedTuple
 
@@ -15,11 +15,11 @@ from rotflex_jax.adaptive.rls import potter_update
 class LatticeStage(NamedTuple):
     """One stage: three regressions with the a-priori errors f and b, one of each per channel.
 
-    Stage m knows the first m + 2 channels; what belongs to the others stays zero. In a `LatticeState` all M
+    Stage m uses the first m + 2 channels; entries of the other channels stay zero. In a `LatticeState` all M
     stages are stacked along a first axis.
 
     Attributes:
-        b: errors of the samples that leave, predicted from those after them.
+        b: errors of the samples that leave, predicted from the samples after them.
         g: gain of the regressions on b.
         gamma: a-posteriori over a-priori error after the stages before this one.
         root_b: square root of the inverse Gram matrix of b.
@@ -62,8 +62,8 @@ def direct_form(stages: LatticeStage, memory: int) -> Float[Array, "P T"]:
     was `C = C before + k b'`, with k the gain of RLS, which the stages hold as well: `k <- k + (old - C) g`.
 
     Args:
-        stages: of a lattice, along the first axis.
-        memory: its memory.
+        stages: stages of a lattice, along the first axis.
+        memory: memory of the lattice.
     """
     names = monomials(memory)
     place = {delays: i for i, delays in enumerate(names)}
@@ -104,8 +104,8 @@ class LatticeState(NamedTuple):
     Attributes:
         u: the last `memory - 1` input samples, newest first.
         stages: one per sample of memory, along the first axis.
-        level: coefficient of the residual that the stages leave of a constant.
-        energy: of that residual, the weighted sum of its squares.
+        level: coefficient of the residual of a constant after all stages.
+        energy: weighted sum of squares of this residual.
     """
 
     u: Float[Array, " M-1"]
@@ -115,32 +115,32 @@ class LatticeState(NamedTuple):
 
 
 class VolterraLattice(AdaptiveFilter):
-    """RLS on all products of up to two of the last M input samples, without forming them all.
+    """RLS on all products of up to two of the last M input samples, without computing all of them.
 
-    Stage m goes from the memory m to m + 1. What is new in the regressors is `u_t (1, u_t, ...,
-    u_(t-m))`, what leaves them `u_(t-m) (1, u_(t-m), ..., u_t)`, so the series is a linear filter with
-    M + 1 channels, of which stage m knows m + 2. The parts of the new (f) and of the old (b) that the samples
-    between do not predict are regressed on each other, and the output on b. Each of these small
-    regressions is corrected by its a-priori errors, and weighs its samples by the ratio of a-posteriori
-    to a-priori error after the stages before it.
+    Stage m increases the memory from m to m + 1. The new regressors are `u_t (1, u_t, ..., u_(t-m))`, the
+    regressors that leave are `u_(t-m) (1, u_(t-m), ..., u_t)`. So the series is a linear filter with M + 1
+    channels, of which stage m uses m + 2. The parts of the new regressors (f) and of the old ones (b) that
+    the samples in between do not predict are regressed on each other, and the output is regressed on b. Each
+    of these small regressions is corrected by its a-priori errors, and weights its samples by the ratio of
+    a-posteriori to a-priori error after the stages before it.
 
-    The a-priori errors are those of `RLS` on the same regressors to rounding, with the same start:
-    `RLS(lam, delta=lattice.start)`. A start has to be the same for every stage at any time, so the
-    delayed regressors are taken as excited earlier, which is forgotten by the same factor:
+    The a-priori errors agree to rounding with the errors of `RLS` on the same regressors with the same start:
+    `RLS(lam, delta=lattice.start)`. A start has to be the same for every stage at any time. The delayed
+    regressors are therefore assumed to have been excited earlier, which is forgotten by the same factor:
     `P0 = delta lam^j`, with j the smaller delay of a regressor. With `lam = 1` it is `delta` for all.
 
-    One sample costs of the order of M^3 operations, RLS M^4. Not for speed at a small memory, where
-    the many small steps take longer than one large one. Nor for regressors other than these: other
-    degrees, an orthonormal basis, a first delay that is not in the input it is given.
+    One sample needs of the order of M^3 operations, with RLS of the order of M^4. Not for a small memory,
+    where many small steps take longer than one large step. Also not for other regressors: other degrees, an
+    orthonormal basis, or a first delay that the given input does not contain.
 
-    Its `phi` is the input `u` (N,) itself. Its weights are in the order constant, u_t ... u_(t-M+1),
-    then u_(t-i) u_(t-j) for i <= j, by i.
+    The argument `phi` of the filter is the input `u` (N,) itself. The weights have the order constant,
+    u_t ... u_(t-M+1), then u_(t-i) u_(t-j) for i <= j, by i.
 
     Args:
-        memory: M [samples].
+        memory: memory M [samples].
         lam: forgetting factor, above 0 and at most 1 [-].
         delta: start of the inverse Gram matrix, as in `RLS` [1 / regressor^2].
-        constant: whether a constant is among the regressors.
+        constant: whether the regressors include a constant.
 
     Source: Syed and Mathews, IEEE Trans. Circuits Syst. II 41(3), 1994, 202-214; a-priori errors with
     feedback: Ling, Manolakis and Proakis 1986.
@@ -164,7 +164,7 @@ class VolterraLattice(AdaptiveFilter):
 
     @property
     def size(self) -> int:
-        """How many weights, one of the constant, M linear and M (M + 1) / 2 quadratic ones."""
+        """Number of weights: one for a constant, M linear and M (M + 1) / 2 quadratic ones."""
         return len(monomials(self.memory)) + self.constant
 
     @property
@@ -174,7 +174,7 @@ class VolterraLattice(AdaptiveFilter):
         return np.asarray(self.delta, float) * np.asarray(self.lam, float) ** np.array(delays)
 
     def init(self, size: int, dtype: Any) -> LatticeState:
-        """All weights zero, after silence; `size` plays no part."""
+        """All weights zero, after zero input; `size` is not used."""
         del size
         real_data("VolterraLattice", dtype)
         M, n = self.memory, self.memory + 1

@@ -1,4 +1,4 @@
-"""The learning curve that theory predicts for LMS: mean weights, excess error, settling time."""
+"""Learning curve of LMS as predicted by theory: mean weights, excess error, settling time."""
 
 import dataclasses
 
@@ -15,12 +15,12 @@ LONGEST_SETTLING = 1e8
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class LearningCurve:
-    """What to expect on average over many runs.
+    """Predicted averages over many runs.
 
     Attributes:
-        times: samples seen.
+        times: numbers of processed samples.
         weights: mean weights.
-        excess: mean squared error beyond the smallest, in the units of the squared output.
+        excess: mean squared error less the smallest mean squared error [output^2].
     """
 
     times: Float[np.ndarray, " K"]
@@ -29,17 +29,17 @@ class LearningCurve:
 
 
 def settling_step_size(eigenvalue: float, samples: float, within: float = 0.05) -> float:
-    """Step size with which a mode has come within a share of its final value after a number of samples.
+    """Step size with which a mode is within a share of its final value after a number of samples.
 
         mu = ln(1 / within) / (samples eigenvalue)
 
     Args:
-        eigenvalue: of R along the mode [regressor^2].
-        samples: how many.
+        eigenvalue: eigenvalue of R for the mode [regressor^2].
+        samples: number of samples.
         within: remaining share; 0.05 gives ln 20.
 
     Raises:
-        InputError: numbers that are not positive, or a share that is not below one.
+        InputError: a number is not positive, or the share is not below one.
 
     >>> [round(settling_step_size(eigenvalue, 7000), 6) for eigenvalue in (1, 2, 7)]
     [0.000428, 0.000214, 6.1e-05]
@@ -61,20 +61,20 @@ def learning_curve(
     noise: float = 0.0,
     start: Float[np.ndarray, " P"] | None = None,
 ) -> LearningCurve:
-    """Mean weights and excess error of LMS, exactly for independent samples.
+    """Mean weights and excess error of LMS, exact for independent samples.
 
-    Beyond some seventy regressors it takes long and much memory: the whole recursion is decomposed.
+    Above about seventy regressors it needs much time and memory, since the whole recursion is decomposed.
 
     Args:
-        moments: of the regressors.
+        moments: moments of the regressors.
         mu: step size, one or one per weight.
-        weights: best weights, which the mean converges to.
-        times: samples seen, in any order.
+        weights: best weights, to which the mean converges.
+        times: numbers of processed samples, in any order.
         noise: smallest mean squared error J0.
         start: first weights; zero if None.
 
     Raises:
-        InputError: step sizes as in `analyse`.
+        InputError: the step sizes are not valid, as in `analyse`.
     """
     exact, moving = recursion(moments, mu)
     best, first = (
@@ -86,7 +86,7 @@ def learning_curve(
     along = exact.vectors.T @ delta
     decay = (1 - exact.values) ** t[:, None]
     mean = np.tile(first, (len(t), 1))
-    still = delta - exact.vectors @ along  # directions without any signal stay where they are
+    still = delta - exact.vectors @ along  # weight errors in directions without any signal do not change
     mean[:, moving] = best[moving] + exact.root * (still + (decay * along) @ exact.vectors.T)
     diagonal = 1 - pack_sum(exact.values)
     rates, modes = np.linalg.eigh(np.diag(diagonal) + exact.dense())
@@ -111,18 +111,18 @@ def settling_samples(
     """Samples after which the mean of one weight stays within a share of its final value.
 
     Args:
-        moments: of the regressors.
+        moments: moments of the regressors.
         mu: step size, one or one per weight.
-        weights: best weights; their size matters, as slow modes mix them.
+        weights: best weights; all of them matter, since slow modes mix them.
         coefficient: index of the weight, whose best value is not zero.
         within: the share.
         start: first weights; zero if None.
 
     Returns:
-        The number of samples; infinite where it never settles.
+        The number of samples; infinite if the weight never settles.
 
     Raises:
-        InputError: a best value of zero, of which no share can be taken.
+        InputError: the best value of the weight is zero.
     """
     exact, moving = recursion(moments, mu)
     best = np.asarray(weights, float)
@@ -174,17 +174,17 @@ def settling_factor(
     """Factor on step sizes with which one weight settles after the given number of samples.
 
     Args:
-        moments: of the regressors.
+        moments: moments of the regressors.
         direction: step size, one or one per weight.
         weights: best weights.
         coefficient: index of the weight.
-        samples: when it is to be settled.
-        scaled: mask of the step sizes that the factor multiplies, for instance those of the
+        samples: number of samples after which the weight should have settled.
+        scaled: mask of the step sizes that the factor multiplies, for instance the step sizes of the
             quadratic weights only; all of them if None.
-        within: the share.
+        within: share of the final value within which the weight has settled.
 
     Returns:
-        The smallest such factor; infinite where none settles that early. Compare with `mean_square_bound`.
+        The smallest such factor; infinite if no factor is sufficient. Compare it with `mean_square_bound`.
     """
     base = step_sizes(moments, direction)
     mask = np.ones(moments.size, dtype=bool) if scaled is None else np.asarray(scaled, dtype=bool)
@@ -193,7 +193,8 @@ def settling_factor(
         mu = np.where(mask, base * np.exp(log_factor), base)
         return settling_samples(moments, mu, weights, coefficient, within=within) <= samples
 
-    # Not monotone: beyond some size the mean overshoots. So the first factor from below is taken.
+    # The settling time is not monotone, since the mean overshoots with large factors: the first factor from
+    # below is taken.
     low = -12.0
     while not in_time(low + 0.25):
         low += 0.25

@@ -27,13 +27,13 @@ class LMS(AdaptiveFilter):
 
         e = y - w phi,    w <- (1 - mu leakage) w + mu e conj(phi)
 
-    There is no factor 2: a step is `-mu / 2` times the gradient of `|e|^2`. For complex data the
-    gradient is Wirtinger's, of `e conj(e)` with `y_hat = w phi` (no conjugate in the product), whose
-    steepest descent has the conjugate of `phi`; on real data it is the same rule.
+    There is no factor 2: a step is `-mu / 2` times the gradient of `|e|^2`. For complex data the gradient is
+    the Wirtinger gradient of `e conj(e)` with `y_hat = w phi` (no conjugate in the product), whose steepest
+    descent has the conjugate of `phi`. For real data the rule is the same.
 
-    A Volterra series wants a step size per degree (`Volterra.step_sizes`), as powers of the input
-    differ in size. Not for strongly correlated regressors: their slowest direction takes longer than
-    the fastest by the condition number. Use `RLS`, or orthogonalise first.
+    A Volterra series needs a step size per degree (`Volterra.step_sizes`), since powers of the input differ
+    in size. Not for strongly correlated regressors: the slowest direction takes longer than the fastest by
+    the condition number. Use `RLS`, or orthogonalise the regressors first.
 
     Args:
         mu: step size, one or one per weight (P,) [1 / regressor^2].
@@ -73,14 +73,14 @@ class NLMS(AdaptiveFilter):
 
         w <- w + mu e conj(phi) / (eps + |phi|^2)
 
-    Stable for `0 < mu < 2` whatever the size of the input. Not where the model is incomplete and the
-    least squares answer is wanted: weighing samples by `1 / (eps + |phi|^2)` moves the point where
-    the weights come to rest, however small the step (`fixed_point`). That point belongs to quiet
-    samples; with the squares of a Volterra series among the regressors it can be far off.
+    Stable for `0 < mu < 2` whatever the size of the input. Not for an incomplete model from which the least
+    squares solution is expected: the weights `1 / (eps + |phi|^2)` of the samples move the point to which the
+    filter converges, however small the step (`fixed_point`). Samples with a small input dominate this point.
+    With the squares of a Volterra series among the regressors it can be far from least squares.
 
     Args:
         mu: step size [-].
-        eps: keeps the step finite at a zero input [regressor^2].
+        eps: constant that keeps the step finite at zero input [regressor^2].
 
     Source: Nagumo and Noda 1967; Haykin, Adaptive Filter Theory, 4th ed. 2002, chapter 6.
     """
@@ -109,20 +109,20 @@ class NLMS(AdaptiveFilter):
 def fixed_point(
     phi: Float[np.ndarray, "N P"], y: Float[np.ndarray, " N"], eps: float = 1e-3
 ) -> Float[np.ndarray, " P"]:
-    """Weights around which NLMS with a small step comes to rest.
+    """Weights to which NLMS converges with a small step.
 
         sum_k e_k phi_k / (eps + |phi_k|^2) = 0
 
-    This is least squares with the weight `1 / (eps + |phi|^2)` on every sample. It equals ordinary
-    least squares where the model is complete (e is then unrelated to phi), and differs where it is not.
+    This is least squares with the weight `1 / (eps + |phi|^2)` for every sample. It agrees with ordinary
+    least squares if the model is complete (e is then independent of phi), and differs otherwise.
 
     Args:
         phi: regressors.
         y: measured output.
-        eps: of the filter [regressor^2].
+        eps: constant `eps` of the filter [regressor^2].
 
     Raises:
-        InputError: shapes that do not fit, or `eps` not positive.
+        InputError: shapes do not fit, or `eps` is not positive.
 
     >>> phi = np.array([[1.0], [2.0], [3.0]])
     >>> fixed_point(phi, 2 * phi[:, 0]).round(6)
@@ -153,15 +153,14 @@ class AffineProjection(AdaptiveFilter):
 
         w <- w + mu X' (eps I + X X')^-1 (y - X w),    X = the last K regressors as rows
 
-    With K = 1 it is NLMS, and its errors vanish over the window as `mu` nears 1. It undoes some of
-    the correlation of the input, at about 3 K P operations. Not for noisy records: the noise of K
-    samples is projected too. Like NLMS it does not come to rest at least squares where the model is
-    incomplete.
+    With K = 1 it is NLMS. The errors over the window vanish as `mu` approaches 1. The filter removes a part
+    of the correlation of the input, with about 3 K P operations per sample. Not for noisy records: the noise
+    of K samples is projected too. Like NLMS it does not converge to least squares if the model is incomplete.
 
     Args:
         mu: step size, stable below 2 [-].
-        eps: keeps the inverse finite [regressor^2].
-        window: samples K.
+        eps: constant that keeps the inverse finite [regressor^2].
+        window: number of samples K.
 
     Source: Ozeki and Umeda 1984; Haykin, Adaptive Filter Theory, 4th ed. 2002, chapter 6.
     """
@@ -189,7 +188,8 @@ class AffineProjection(AdaptiveFilter):
         X = jnp.concatenate([phi[None], state.phi[:-1]])
         target = jnp.concatenate([y[None], state.y[:-1]])
         e = target - times(X, state.w)
-        # Only the products with the newest are new; the others move along, so nothing adds up.
+        # Only products with the newest regressor are computed. The others are shifted, so that rounding
+        # errors do not accumulate.
         new = times(X, phi)
         gram = jnp.concatenate([new[:, None], jnp.concatenate([new[None, 1:], state.gram[:-1, :-1]])], axis=1)
         z = solve(gram + self.eps * jnp.eye(self.window, dtype=phi.dtype), e)
@@ -199,8 +199,8 @@ class AffineProjection(AdaptiveFilter):
 def solve(A: Float[Array, "K K"], b: Float[Array, " K"]) -> Float[Array, " K"]:
     """The solution of `A x = b` for a small positive definite A, by elimination.
 
-    Written out, since a call of a linear algebra library inside a scan costs more than the rest of
-    the loop. Positive definite matrices need no pivoting.
+    The elimination is written out, since a call of a linear algebra library inside a scan takes longer than
+    the rest of the loop. Positive definite matrices need no pivoting.
     """
     K = len(b)
     rows = jnp.concatenate([A, b[:, None]], axis=1)

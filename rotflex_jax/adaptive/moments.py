@@ -1,8 +1,8 @@
-"""Second and fourth moments of regressors: all that the theory of LMS needs to know of a signal.
+"""Second and fourth moments of regressors, from which the theory of LMS follows.
 
     R = E[phi phi'],    S(W) = E[phi phi' W phi phi']
 
-They come from a Gaussian input, exactly, or from the regressors of any recording.
+They are exact for a Gaussian input, or sample moments of the regressors of any recording.
 """
 
 import dataclasses
@@ -25,14 +25,14 @@ def exponents(terms: Sequence[Index], size: int) -> Int[np.ndarray, "P {size}"]:
 
 
 class GaussianMoments:
-    """Moments of a zero-mean Gaussian vector, stored once they are computed.
+    """Moments of a zero-mean Gaussian vector, each computed once and stored.
 
         E[z_i z^b] = sum_j b_j R_ij E[z^(b - e_j)]
 
-    Every entry is paired with each of the others in turn; equal partners count as often as they occur.
+    Every entry is paired with each of the others in turn, and equal partners count as often as they occur.
 
     Args:
-        covariance: of the vector.
+        covariance: covariance of the vector.
 
     Source: Isserlis 1918, Biometrika 12; Wick 1950.
 
@@ -84,7 +84,7 @@ def checked_covariance(covariance: Float[np.ndarray, "n n"]) -> Float[np.ndarray
     """The covariance in float64.
 
     Raises:
-        InputError: it is not square, symmetric, finite and without negative eigenvalues.
+        InputError: the matrix is not square, symmetric and finite, or has negative eigenvalues.
     """
     R = np.asarray(covariance, dtype=float)
     if R.ndim != 2 or R.shape[0] != R.shape[1] or not len(R) or not np.all(np.isfinite(R)):
@@ -114,7 +114,7 @@ class Moments:
     Attributes:
         R: E[phi phi'].
         pairs: S as a matrix over packed symmetric matrices, D = P (P + 1) / 2; None for samples.
-        samples: regressors that all moments are means over; None for exact moments.
+        samples: regressors over which all moments are means; None for exact moments.
     """
 
     R: Float[np.ndarray, "P P"]
@@ -128,19 +128,19 @@ class Moments:
         degrees: Sequence[int] = (0, 1, 2),
         layout: str = "triangular",
     ) -> "Moments":
-        """Monomials of a zero-mean Gaussian vector, exactly.
+        """Exact moments of monomials of a zero-mean Gaussian vector.
 
-        Five entries of degree 2 with the constant (P = 21) take 0.4 MB and no time, ten (P = 66) 40 MB,
-        twelve (P = 91) 140 MB, and bounds some four times that while they are computed. Sixteen
-        (P = 153) would take 1.1 GB: use `of_regressors`.
+        Up to degree 2 with the constant, five entries (P = 21) need 0.4 MB and almost no time, ten entries
+        (P = 66) 40 MB, twelve (P = 91) 140 MB. The computation of bounds needs about four times as much.
+        Sixteen entries (P = 153) would need 1.1 GB: use `of_regressors`.
 
         Args:
-            covariance: of the entries, for instance `ar1_covariance(0.5, 5)`.
-            degrees: of the monomials; 0 is the constant.
+            covariance: covariance of the entries, for instance `ar1_covariance(0.5, 5)`.
+            degrees: degrees of the monomials; 0 is the constant.
             layout: "triangular", or "full" with every product as often as it can be written.
 
         Raises:
-            InputError: no covariance, or more monomials than the memory holds.
+            InputError: the matrix is no covariance, or the moments need too much memory.
 
         Source: Isserlis 1918, Biometrika 12.
 
@@ -154,14 +154,14 @@ class Moments:
 
     @classmethod
     def of_basis(cls, basis: Volterra | Orthogonalised, covariance: Float[np.ndarray, "n n"]) -> "Moments":
-        """Regressors of a Volterra series, orthogonalised or not, under a zero-mean Gaussian input, exactly.
+        """Exact moments of the regressors of a Volterra series under a zero-mean Gaussian input.
 
         Args:
-            basis: the regressors.
-            covariance: of the outputs of its bank.
+            basis: Volterra series, orthogonalised or not.
+            covariance: covariance of the outputs of its bank.
 
         Raises:
-            InputError: as `gaussian`, or a covariance that does not fit the bank.
+            InputError: as in `gaussian`, or the covariance does not fit the bank.
         """
         if isinstance(basis, Orthogonalised):
             return cls.of_basis(basis.volterra, covariance).transformed(np.asarray(basis.transform))
@@ -191,16 +191,16 @@ class Moments:
 
     @classmethod
     def of_regressors(cls, phi: Float[np.ndarray, "N P"]) -> "Moments":
-        """Sample moments of regressors, whatever the input was.
+        """Sample moments of regressors, for any input.
 
-        Fourth moments of squares are eighth moments of the input: some ten thousand samples give
-        bounds to about 5 %, a few hundred only their size.
+        Fourth moments of squares are eighth moments of the input. With about ten thousand samples, bounds are
+        accurate to about 5 %; a few hundred samples only give the order of magnitude.
 
         Args:
             phi: regressors, for instance `basis.regressors(recording.u)`.
 
         Raises:
-            InputError: no matrix of finite numbers, or one beyond the memory.
+            InputError: `phi` is no matrix of finite numbers, or the moments need too much memory.
         """
         phi = np.asarray(phi, dtype=float)
         if phi.ndim != 2 or not phi.size or not np.all(np.isfinite(phi)):
@@ -217,17 +217,17 @@ class Moments:
 
     @property
     def size(self) -> int:
-        """Regressors P."""
+        """Number of regressors P."""
         return len(self.R)
 
     @property
     def eigenvalues(self) -> Float[np.ndarray, " P"]:
-        """Of R, rising."""
+        """Eigenvalues of R in ascending order."""
         return np.linalg.eigvalsh(self.R)
 
     @property
     def condition(self) -> float:
-        """Largest over smallest eigenvalue of R, how much slower LMS is in its slowest direction."""
+        """Condition number of R: ratio of the slowest to the fastest time constant of LMS."""
         values = self.eigenvalues
         return float(values[-1] / values[0]) if values[0] > 0 else float("inf")
 
@@ -240,7 +240,7 @@ class Moments:
         return self.samples.T @ (self.samples * square) / len(self.samples)
 
     def transformed(self, T: Float[np.ndarray, "P Q"]) -> "Moments":
-        """Moments of the regressors phi T: others of the same span, or some of them.
+        """Moments of the regressors phi T: other regressors of the same span, or some of the regressors.
 
         >>> Moments.gaussian(np.eye(2), (1,)).transformed(np.array([[2.0], [0.0]])).R
         array([[4.]])
@@ -257,11 +257,11 @@ def ar1_covariance(a: float, memory: int) -> Float[np.ndarray, "memory memory"]:
     """Covariance a^|i - j| of successive samples of u[k] = a u[k-1] + sqrt(1 - a^2) w[k].
 
     Args:
-        a: correlation of neighbours; exp(-2 pi fc Ts) for a corner frequency fc.
-        memory: how many samples.
+        a: correlation of neighbouring samples; exp(-2 pi fc Ts) for a corner frequency fc.
+        memory: number of samples.
 
     Raises:
-        InputError: no stationary process has it.
+        InputError: there is no stationary process with this correlation.
 
     >>> ar1_covariance(0.5, 3)[0]
     array([1.  , 0.5 , 0.25])

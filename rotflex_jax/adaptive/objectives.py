@@ -4,9 +4,9 @@
     mean_error  mean square of the a-priori errors over the whole run
     last_half   the same over its second half
 
-`final` measures a model and favours small steps. The other two measure the filter while it runs: they
-favour weights that follow the recording, which no frozen model repeats, and `mean_error` above all fast
-initial convergence.
+`final` is a measure of a model and favours small steps. The other two are measures of the running filter:
+they favour weights that follow the recording, which a frozen model does not do, and `mean_error` especially
+favours fast initial convergence.
 """
 
 import dataclasses
@@ -32,11 +32,11 @@ from rotflex_jax.recording.samples import of_one_period
 from rotflex_jax.runtime.xla import double_precision, spread
 
 FilterBuilder = Callable[[dict[str, Any]], AdaptiveFilter | tuple[AdaptiveFilter, Basis]]
-"""Makes a filter, or a filter and a basis, from settings by name."""
+"""Function of settings by name that returns a filter, or a filter and a basis."""
 
 
 def build_filter(build: FilterBuilder, settings: dict[str, Any]) -> tuple[AdaptiveFilter, Basis | None]:
-    """Filter, and the basis where it has settings too."""
+    """The filter for some settings, and the basis if it depends on the settings too, else None."""
     made = build(settings)
     return made if isinstance(made, tuple) else (made, None)
 
@@ -45,7 +45,7 @@ def starting_sets(starts: Mapping[str, float] | Sequence[Mapping[str, float]]) -
     """One or several sets of settings as a list.
 
     Raises:
-        InputError: none, or sets of different settings.
+        InputError: there are no settings, or the sets have different settings.
     """
     sets = [dict(starts)] if isinstance(starts, Mapping) else [dict(s) for s in starts]
     if not sets or not sets[0] or any(set(s) != set(sets[0]) for s in sets):
@@ -63,11 +63,11 @@ class RangeTransform:
         setting = low + exp(x)  without an upper end,    low + (high - low) / (1 + exp(-x))  with one
 
     Attributes:
-        names: of the settings.
-        ranges: lower and upper end of each; the upper may be infinite.
+        names: names of the settings.
+        ranges: lower and upper end of each setting; the upper end may be infinite.
 
     Raises:
-        InputError: a range that does not rise from a finite number.
+        InputError: the lower end of a range is not finite, or not below the upper end.
     """
 
     names: tuple[str, ...]
@@ -82,17 +82,17 @@ class RangeTransform:
                 )
 
     def settings(self, x: Float[Array, " n"]) -> dict[str, Float[Array, ""]]:
-        """The settings at a point, traced."""
+        """The settings at a point of the coordinates, which may be traced."""
         return {
             name: low + (jnp.exp(x[i]) if np.isinf(high) else (high - low) * jax.nn.sigmoid(x[i]))
             for i, (name, (low, high)) in enumerate(zip(self.names, self.ranges, strict=True))
         }
 
     def free(self, settings: Mapping[str, float]) -> Float[np.ndarray, " n"]:
-        """The point of given settings.
+        """The point of the coordinates for given settings.
 
         Raises:
-            InputError: a setting on or beyond an end of its range.
+            InputError: a setting is not inside its range.
         """
         x = []
         for name, (low, high) in zip(self.names, self.ranges, strict=True):
@@ -111,9 +111,9 @@ class TuningPath:
     """One descent, from its start to its end.
 
     Attributes:
-        points: settings by name, the start first.
-        values: objective, penalty included.
-        evaluations: filters run, each with its derivatives.
+        points: name of a setting -> its values, the start first.
+        values: objective with the penalty.
+        evaluations: number of runs of the filter, each with derivatives.
         status: "minimum", "no further progress", "evaluations used up" or "no finite value".
     """
 
@@ -128,17 +128,18 @@ class Tuned:
     """Settings of a filter, chosen by gradient or on a grid.
 
     Attributes:
-        settings: by name.
-        value: objective on the recordings that were tuned on.
-        test: the same on the others; NaN if there were none.
+        settings: name -> value of each setting.
+        value: objective on the recordings for tuning.
+        test: objective on the test recordings; NaN without test recordings.
         objective: "final", "mean_error" or "last_half".
-        unit: of `value` and `test`, in words.
-        filter: with the settings in it.
-        basis: with the settings in it.
-        evaluations: settings tried in all.
-        stability: of the step sizes, where the theory of LMS applies and the weights are not too many.
-        paths: one descent per start; none for a grid.
-        axes: settings tried on a grid, by name; empty for a descent.
+        unit: unit of `value` and `test`, in words.
+        filter: filter with these settings.
+        basis: basis with these settings.
+        evaluations: total number of settings that were tried.
+        stability: stability of the step sizes, or None if the theory of LMS does not apply or there are too
+            many weights.
+        paths: one descent for each start; empty for a grid.
+        axes: name -> values on a grid; empty for a descent.
         values: objective on the grid, one axis per setting; NaN or infinite where the filter diverged.
     """
 
@@ -179,18 +180,18 @@ Objective = Literal["final", "mean_error", "last_half"]
 
 
 class TuningData(eqx.Module):
-    """Recordings of one length, and the least-squares weights that the objectives are relative to.
+    """Recordings of one length, and the least-squares weights to which the objectives are relative.
 
-    The first `n_init` samples are left out: their regressors reach back to before the recording.
+    The first `n_init` samples are left out, since their regressors depend on samples before the recording.
 
     Attributes:
         u: inputs.
         y: outputs.
         phi: regressors of the basis as given, L = N - n_init.
-        skip: samples left out.
-        best: best weights for all recordings but one, K = R, or for all, K = 1.
-        gram: mean of phi phi' over the same recordings.
-        smallest: mean squared error of these weights.
+        skip: number of samples that are left out.
+        best: least-squares weights, for all recordings except one in turn (K = R) or for all (K = 1).
+        gram: mean of phi phi' over the recordings of each fit.
+        smallest: mean squared error of each fit.
     """
 
     u: Float[Array, "R N"]
@@ -206,13 +207,14 @@ def tuning_data(basis: Basis, recordings: Sequence[Recording], channel: str, obj
     """Recordings prepared for an objective.
 
     Args:
-        basis: of the regressors.
-        recordings: of one length and sampling period; at least two for "final".
-        channel: output to be followed.
+        basis: basis that gives the regressors.
+        recordings: recordings of one length and sampling period; at least two for "final".
+        channel: output of the filter.
         objective: "final", "mean_error" or "last_half".
 
     Raises:
-        InputError: an unknown objective, or recordings that do not go together.
+        InputError: the objective is unknown, there are too few recordings, or they differ in length or
+            sampling period.
     """
     if objective not in get_args(Objective):
         raise InputError(
@@ -240,8 +242,8 @@ def tuning_data(basis: Basis, recordings: Sequence[Recording], channel: str, obj
     for b in held:
         X = np.concatenate([phi[k] for k in range(len(u)) if k != b])
         Y = np.concatenate([y[k, skip:] for k in range(len(u)) if k != b])
-        # Minimum norm: equal columns, as in the full layout, are allowed. The triangle has the answer of
-        # all rows, and is found far quicker than their singular values.
+        # Minimum norm, since equal columns, as in the full layout, are allowed. The QR triangle gives the
+        # same solution as all rows, and much faster than their singular values.
         R = np.asarray(np.linalg.qr(np.concatenate([X, Y[:, None]], axis=1), mode="r"))
         w = np.linalg.lstsq(R[:, :-1], R[:, -1], rcond=np.finfo(float).eps * max(X.shape))[0]
         best.append(w)
@@ -256,18 +258,18 @@ def tuning_data(basis: Basis, recordings: Sequence[Recording], channel: str, obj
 def evaluate(
     data: TuningData, objective: Objective, filter: AdaptiveFilter, basis: Any = None
 ) -> Float[Array, ""]:
-    """The objective, traced: settings of the filter and poles of the basis may carry derivatives.
+    """The objective in traced code, differentiable by settings of the filter and poles of the basis.
 
     Args:
         data: recordings.
-        objective: which.
-        filter: started again on every recording.
-        basis: given where it changes; its error is then compared with the variance of the output,
-            for the best weights are no longer the same.
+        objective: name of the objective.
+        filter: filter, which starts again on every recording.
+        basis: basis, if it changes during tuning. The error is then relative to the variance of the output,
+            since the least-squares weights change too.
 
     Returns:
-        For a fixed basis the excess over the smallest error, in its units ("final"), or the error in units
-        of the smallest; for a changing basis the error in units of the output's variance.
+        For a fixed basis the excess over the smallest error ("final") or the error, both in units of the
+        smallest error; for a changing basis the error in units of the output's variance.
     """
     y = data.y[:, data.skip :]
     phi = data.phi
@@ -281,7 +283,7 @@ def evaluate(
         return jnp.mean(errors[:, errors.shape[1] // 2 :] ** 2) / unit
     weights = jax.vmap(filter.weights)(states)
     if basis is None:
-        # (w - best)' R (w - best): the excess without the difference of two nearly equal numbers.
+        # (w - best)' R (w - best): the excess error without a difference of two nearly equal numbers.
         miss = weights - data.best
         return jnp.mean(jnp.einsum("bp,bpq,bq->b", miss, data.gram, miss) / data.smallest)
     e = y[None] - jnp.einsum("blp,ap->abl", phi, weights)
@@ -297,13 +299,13 @@ def objective_unit(objective: Objective, changing: bool) -> str:
 
 
 CACHED_WEIGHTS = 2640
-"""Weights of all settings together that still fit into the fastest cache."""
+"""Largest total number of weights of all settings that fits into the fastest cache."""
 LEAST_SETTINGS_TOGETHER = 32
-"""Settings evaluated together even where the cache is too small, for fewer do not use a processor well."""
+"""Least number of settings that are evaluated together: fewer do not use a processor well."""
 
 
 def settings_together(P: int) -> int:
-    """Most settings that are evaluated together, for P weights each.
+    """Number of settings that are evaluated together, for P weights each.
 
     >>> settings_together(21), settings_together(66), settings_together(1326)
     (120, 40, 32)
@@ -316,14 +318,14 @@ def lms_objectives(
 ) -> Float[Array, " C"]:
     """The objective of LMS at every one of C settings.
 
-    As `evaluate` for each of them, but with the settings along the last axis, so that vector instructions
-    work on C settings at once. Of the errors only the sum of squares is stored.
+    The values agree with `evaluate`, but the settings are along the last axis, so that vector instructions
+    work on C settings at once. Only the sum of squares of the errors is stored.
 
     Args:
         data: recordings.
-        objective: which.
+        objective: name of the objective.
         mu: step sizes.
-        leakage: one for each setting; None for none.
+        leakage: leakage for each setting; None for none.
     """
     C, P = mu.shape
     step, y = mu.T, data.y[:, data.skip :]
@@ -340,7 +342,7 @@ def lms_objectives(
     def run(recording: tuple[Array, Array]) -> tuple[Array, Array]:
         phi, y = recording
         w, none = jnp.zeros((P, C), y.dtype), jnp.zeros(C, y.dtype)
-        if first:  # the errors before it do not count
+        if first:  # earlier errors do not count
             w, _ = jax.lax.scan(update, (w, none), (phi[:first], y[:first]))[0]
         return jax.lax.scan(update, (w, none), (phi[first:], y[first:]))[0]
 

@@ -25,11 +25,11 @@ def potter_update(
         v = S' phi,  a = lam / gamma + v'v,  g = S v / a,
         S <- (S - g v' / (1 + sqrt(lam / (gamma a)))) / sqrt(lam)
 
-    P stays positive whatever the rounding, and S needs half the digits that P needs: against extended
-    precision the errors of RLS come out a thousand times smaller than with a recursion for P.
+    P stays positive despite rounding, and S needs half as many digits as P: compared with extended precision,
+    the errors of RLS are a thousand times smaller than with a recursion for P.
 
     Args:
-        S: square root, of any form.
+        S: square root of P, of any form.
         phi: regressor.
         lam: forgetting factor.
         gamma: weight of the sample.
@@ -59,18 +59,18 @@ class RLS(AdaptiveFilter):
         g = P phi / (lam + phi' P phi),    w <- w + g e,    P <- (P - g phi' P) / lam
 
     After n samples `w` minimises `sum lam^(n-k) e_k^2 + lam^n sum_i w_i^2 / delta_i`: with `lam = 1` it
-    is ridge regression with ridge `1 / delta`. Forgetting means the last `1 / (1 - lam)` samples or so.
+    is ridge regression with ridge `1 / delta`. With forgetting, about the last `1 / (1 - lam)` samples count.
 
-    It carries a square root of P, which therefore is symmetric and positive whatever the rounding:
-    a large `delta` costs no accuracy, and float32 will do.
+    The state holds a square root of P, so that P is symmetric and positive despite rounding: a large `delta`
+    costs no accuracy, and float32 is sufficient.
 
-    Not with `lam < 1` on an input that goes quiet: what is not excited is forgotten, and P grows
-    without bound. One step costs of the order of P^2 operations; LMS costs P.
+    Not with `lam < 1` for an input that becomes small: directions that are not excited are forgotten, and P
+    grows without bound. One step needs of the order of P^2 operations; LMS needs P.
 
     Args:
         lam: forgetting factor, above 0 and at most 1 [-].
-        delta: the start `P = delta I`, one or one per weight (P,) [1 / regressor^2]. Large means that
-            zero weights are no information.
+        delta: the start `P = delta I`, one or one per weight (P,) [1 / regressor^2]. With a large value the
+            zero weights at the start carry no information.
 
     Source: Haykin, Adaptive Filter Theory, 4th ed. 2002, chapter 9; square root: Potter 1963, in Bierman,
     Factorization Methods for Discrete Sequential Estimation, 1977.
@@ -116,9 +116,9 @@ class Kalman(AdaptiveFilter):
 
         w[k+1] = w[k] + N(0, q),    y[k] = w[k] phi[k] + N(0, r)
 
-    With `q = 0` and `r = 1` it is RLS without forgetting and `p0` is its `delta`. Other than forgetting,
-    `q` lets P grow by a fixed amount per sample, so that a quiet input does no quick harm. The state
-    holds the covariance of the weights, in their units if `r` and `q` are.
+    With `q = 0` and `r = 1` it is RLS without forgetting, and `p0` is its `delta`. In contrast to forgetting,
+    `q` increases P by a fixed amount per sample, so that a short time of small input does no harm. The state
+    holds the covariance of the weights, in their units if `r` and `q` have their units.
 
     Not in float32 with a large `p0`: P is updated in Joseph's form, which keeps it symmetric and
     positive in float64, but a start a million times above `r` needs more digits than float32 has.
@@ -153,7 +153,7 @@ class Kalman(AdaptiveFilter):
         e = y - jnp.sum(w * phi)
         v = times(P, phi)
         g = v / (self.r + jnp.sum(v * phi))
-        # (I - g phi') P (I - g phi')' + g r g', one factor after the other.
+        # (I - g phi') P (I - g phi')' + g r g', multiplied one factor after the other.
         P = P - g[:, None] * v[None, :]
         P = P - times(P, phi)[:, None] * g[None, :] + (self.r * g)[:, None] * g[None, :]
         P = (P + P.T) / 2

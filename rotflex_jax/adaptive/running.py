@@ -1,4 +1,4 @@
-"""A filter run over arrays or over a recording: errors, weights, divergence, and the model it ends in."""
+"""Runs of a filter over arrays or over a recording: errors, weights, divergence, and the final model."""
 
 import functools
 from dataclasses import dataclass
@@ -27,16 +27,16 @@ DIVERGENCE_RATIO = 1e4
 
 @dataclass(frozen=True)
 class Run:
-    """Result of a filter over the samples it was given.
+    """Result of a filter over a number of samples.
 
     Attributes:
-        errors: a-priori errors, each made with the weights from before its sample [output]. The
-            weights follow the record meanwhile, so this is the error of no one model, and often far
-            below that of the last weights on other data. NaN after a divergence.
+        errors: a-priori errors, each with the weights before its sample [output]. The weights follow the
+            record, so these are not the errors of one model, and they are often far below the errors of the
+            last weights on other data. NaN after a divergence.
         weights: last weights; of no use after a divergence.
-        path: weights after `path_times` samples; none unless asked for.
-        path_times: samples seen: 0, keep_every, 2 keep_every, ...
-        state: to go on from.
+        path: weights after `path_times` samples; empty if `keep_every` was 0.
+        path_times: numbers of processed samples: 0, keep_every, 2 keep_every, ...
+        state: state from which another run can continue.
         status: "ok", or "diverged at sample k".
     """
 
@@ -64,27 +64,28 @@ def run(
 ) -> Run:
     """Runs a filter over a record, one sample after the other.
 
-    One compiled loop; another call with the same shapes and other values compiles nothing. A filter
-    has diverged where an error is not finite, or ten thousand times larger than any output.
+    The loop is compiled; another call with the same shapes and other values needs no compilation. A filter
+    has diverged if an error is not finite, or more than ten thousand times larger than any output.
 
-    With a basis, the regressors of a Volterra series of delays are formed inside the loop: that is several
-    times quicker than `basis.regressors` beforehand, and no regressors are stored.
+    With a basis, the regressors of a Volterra series of delays are computed inside the loop. This is several
+    times faster than `basis.regressors` beforehand, and no regressors are stored.
 
     Args:
-        filter: with its settings.
-        phi: regressors (N, P); with a basis, or for a filter that makes its own, the input (N,).
+        filter: filter with its settings.
+        phi: regressors (N, P); with a basis, or for a filter that makes its own regressors, the input (N,).
         y: measured output (N,).
-        basis: makes the regressors of the input, which may start before the output: the samples before it
-            only fill the memory of the basis.
-        state: `Run.state` of an earlier run, to go on from; the filter's start if None. Two runs in a
-            row give what one run over all samples gives.
-        keep_every: keep the weights after every so many samples; 0 keeps only the last.
+        basis: basis that gives the regressors of the input. The input may start before the output; the
+            earlier samples only fill the memory of the basis.
+        state: `Run.state` of an earlier run, from which this run continues; the filter's initial state if
+            None. Two successive runs give the same result as one run over all samples.
+        keep_every: number of samples after each of which the weights are stored; 0 stores the last weights
+            only.
 
     Returns:
-        The run, in the precision of the data (float64 where they are whole numbers).
+        The run, in the precision of the data (float64 for whole numbers).
 
     Raises:
-        InputError: shapes that do not fit, or numbers that are not finite. A divergence is no error.
+        InputError: shapes do not fit, or numbers are not finite. A divergence raises no error.
 
     >>> from rotflex_jax.adaptive import LMS
     >>> run(LMS(mu=3.0), np.ones((100, 1)), np.ones(100)).status
@@ -97,7 +98,7 @@ def run(
 
 
 def _over_basis(filter: AdaptiveFilter, basis: Basis, u: Any, y: Any, state: Any, every: int) -> Run:
-    """A run on the regressors that a basis makes of an input."""
+    """A run with the regressors of a basis for an input."""
     if filter.from_input:
         raise InputError(
             f"{type(filter).__name__} makes its own regressors, but `basis` was given too; leave it out."
@@ -115,7 +116,7 @@ def _over_basis(filter: AdaptiveFilter, basis: Basis, u: Any, y: Any, state: Any
         phi, y = as_samples(filter, basis.regressors(u)[before:], y)
         return _run_on(filter, None, phi, y, state, every)
     assert isinstance(basis, Volterra)
-    start = before - basis.bank.first  # of what meets the first output
+    start = before - basis.bank.first  # newest input sample in the first regressors
     x, y = finite(stretch(u, start, start + len(y)), y)
     lags = stretch(u, start - form.memory, start).astype(x.dtype)
     return _run_on(filter, form, x, y, state, every, lags)
@@ -132,7 +133,7 @@ def _run_on(
 ) -> Run:
     size = regressor_size(phi) if form is None else form.size
     with working_precision(np.real(phi)):
-        # Settings of one type however they were given, so that only shapes decide what is compiled.
+        # All settings get the same dtype, so that only new shapes need another compilation.
         real = jnp.finfo(phi.dtype).dtype
         filter = jax.tree.map(lambda leaf: np.asarray(leaf).astype(real), filter)
         start = None if state is None else _resumed(filter, size, phi.dtype, state)
@@ -166,7 +167,7 @@ def _run(
         last = weights(state)
         return close(state), errors, jnp.zeros((0, *last.shape), last.dtype), last
     first = weights(state)
-    # An outer loop over chunks stores the weights at their ends; the samples that fill none follow.
+    # An outer loop stores the weights at the ends of chunks; the remaining samples follow.
     whole = len(y) // every * every
     chunks = jax.tree.map(lambda x: x[:whole].reshape(-1, every, *x.shape[1:]), (phi, y))
 
@@ -190,7 +191,7 @@ def _chunk(keep_every: Any) -> int:
 
 
 def _resumed(filter: AdaptiveFilter, size: int, dtype: Any, state: Any) -> Any:
-    """A state to go on from, in the precision of the data."""
+    """The state of an earlier run, checked, in the precision of the data."""
     wanted = jax.eval_shape(lambda: filter.init(size, dtype))
     shapes = lambda tree: (jax.tree.structure(tree), [np.shape(x) for x in jax.tree.leaves(tree)])  # noqa: E731
     if shapes(state) != shapes(wanted):
@@ -204,7 +205,7 @@ def _resumed(filter: AdaptiveFilter, size: int, dtype: Any, state: Any) -> Any:
 
 def _divergence(errors: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, str]:
     """The errors, NaN after a divergence, and the status."""
-    # A state to go on from may belong to larger outputs; then its first error is large.
+    # The state of an earlier run may belong to larger outputs, so that the first error is large.
     scale = max(_largest(y), float(np.nan_to_num(np.abs(errors[0]), posinf=0.0)))
     if _largest(errors) <= DIVERGENCE_RATIO * scale:
         return errors, "ok"
@@ -219,7 +220,7 @@ def _divergence(errors: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, str]:
 
 
 def _largest(x: np.ndarray) -> float:
-    """Largest magnitude, without a copy of real numbers; NaN where one is not a number."""
+    """Largest magnitude, without a copy of real numbers; NaN if an entry is NaN."""
     return float(np.max(np.abs(x))) if x.dtype.kind == "c" else float(max(np.max(x), -np.min(x)))
 
 
@@ -227,16 +228,15 @@ def _largest(x: np.ndarray) -> float:
 class Identified:
     """Result of a filter over a recording: a run, and a model.
 
-    They have different errors. Those of the run are online: weights that follow the recording predict the
-    next sample, which even a wrong model with a large step size does well. The weights of the model are
-    frozen, and its error on another recording says what was identified. Only that one may be compared with
-    other methods.
+    The errors of the run are online errors: weights that follow the recording predict the next sample, which
+    works well even for a wrong model with a large step size. The weights of the model are frozen, and its
+    error on another recording shows what was identified. Only this error may be compared with other methods.
 
     Attributes:
         run: errors, weights and status of the filter, from sample `n_init` of the recording on.
-        basis: of the regressors.
-        recording: what the filter ran over.
-        channel: the output.
+        basis: basis that gives the regressors.
+        recording: recording over which the filter ran.
+        channel: name of the output.
     """
 
     run: Run
@@ -246,10 +246,10 @@ class Identified:
 
     @property
     def model(self) -> Series:
-        """The last weights, frozen, as a model that simulates.
+        """Model with the last weights, frozen.
 
         Raises:
-            InputError: the filter diverged, so that its weights mean nothing.
+            InputError: the filter diverged, so that its weights are of no use.
         """
         if self.run.diverged:
             raise InputError(
@@ -267,7 +267,7 @@ class Identified:
 
             sum e^2 / sum (y - mean y)^2
 
-        Not a quality of the model: see `frozen_nmse`. NaN after a divergence.
+        Not a measure of the quality of the model: see `frozen_nmse`. NaN after a divergence.
         """
         return _relative(self.run.errors, _scored(self.recording, self.channel))
 
@@ -277,7 +277,7 @@ class Identified:
             sum (y - y_hat)^2 / sum (y - mean y)^2
 
         Args:
-            recording: one that the filter did not see; its first `n_init` samples do not count.
+            recording: recording that the filter did not use; its first `n_init` samples do not count.
         """
         y = _scored(recording, self.channel)
         return _relative(y - self.model.simulate(recording)[recording.n_init :, 0], y)
@@ -286,23 +286,24 @@ class Identified:
 def identify(
     filter: AdaptiveFilter, basis: Basis, recording: Recording, channel: str, *, keep_every: int = 0
 ) -> Identified:
-    """Runs an adaptive filter over a recording, on the regressors that a basis makes of its input.
+    """Runs an adaptive filter over a recording, with the regressors of a basis for its input.
 
-    Nothing is taken off the data: a mean of the output is the basis's constant to learn, and an
-    input's mean stays in it, as powers of the input depend on it. The filter starts at sample
-    `n_init`. The samples before only fill the memory of the basis, which takes the input before the
-    recording as zero; a bank that remembers longer than `n_init` passes its transient on to the
-    filter. `VolterraLattice` makes its own regressors and takes what is before `n_init` as zero too.
+    No means are subtracted from the data: the constant of the basis adapts to the mean of the output, and the
+    mean of the input is kept, since powers of the input depend on it. The filter starts at sample `n_init`.
+    Earlier samples only fill the memory of the basis, which assumes zero input before the recording. If the
+    memory of a bank is longer than `n_init`, its transient affects the filter. `VolterraLattice` makes its
+    own regressors and assumes zero input before sample `n_init`.
 
     Args:
-        filter: with its settings.
-        basis: such as `Volterra(Delays(5))`.
-        recording: its input drives the basis, one of its channels is the output to follow.
-        channel: name of that channel.
-        keep_every: keep the weights after every so many samples; 0 keeps only the last.
+        filter: filter with its settings.
+        basis: basis, such as `Volterra(Delays(5))`.
+        recording: recording whose input drives the basis and of which one channel is the output.
+        channel: name of the output channel.
+        keep_every: number of samples after each of which the weights are stored; 0 stores the last weights
+            only.
 
     Raises:
-        InputError: no such channel, or a basis that is not the one that the filter is made for.
+        InputError: there is no such channel, or the basis does not fit the filter.
     """
     recording = single(recording, "recording")
     instance(filter, AdaptiveFilter, "filter", "give for instance rotflex_jax.adaptive.RLS()")
@@ -315,7 +316,7 @@ def identify(
 
 
 def _own_input(filter: AdaptiveFilter, basis: Basis, recording: Recording) -> Float[np.ndarray, " N"]:
-    """The input of a filter that makes its own regressors, if those are the basis's."""
+    """The input for a filter that makes its own regressors, which must agree with the basis."""
     if not isinstance(filter, VolterraLattice):
         raise InputError(
             f"{type(filter).__name__} makes its own regressors, of which nothing is known here; "
@@ -342,6 +343,6 @@ def _scored(recording: Recording, channel: str) -> Float[np.ndarray, " N"]:
 
 
 def _relative(e: Float[np.ndarray, " N"], y: Float[np.ndarray, " N"]) -> float:
-    """Squares of e relative to those of y about its mean."""
+    """Sum of squares of e relative to the sum of squares of y about its mean."""
     with np.errstate(all="ignore"):
         return float(np.sum(e.astype(float) ** 2) / np.sum((y - np.mean(y)) ** 2))

@@ -1,16 +1,16 @@
 """Step sizes of LMS: stability bounds, rate of convergence and excess error.
 
-Step sizes are taken into the regressors, `x = sqrt(mu) phi`, and the squared weight errors are scaled
-accordingly; `c` multiplies all step sizes together. With `R = E[x x']`, `A(C) = R C + C R` and
+The regressors include the step sizes, `x = sqrt(mu) phi`, and the second moments C of the weight errors are
+scaled accordingly; the factor `c` multiplies all step sizes. With `R = E[x x']`, `A(C) = R C + C R` and
 `S(C) = E[x x' C x x']`
 
     C <- C - c A(C) + c^2 S(C) + c J0 R
 
-A and S are symmetric, and A is diagonal over the eigenvectors of R. So everything comes from the
-eigenvalues of `A^-1/2 S A^-1/2`, whose largest is one over the largest stable `c`.
+A and S are symmetric, and A is diagonal over the eigenvectors of R. So all results follow from the
+eigenvalues of `A^-1/2 S A^-1/2`, of which the largest is one over the largest stable `c`.
 
-The theory takes successive regressors as independent. Those of a delay line are not, and the weights
-diverge earlier: stay below a third of the mean-square bound on real signals. The bound on the mean
+The theory assumes that successive regressors are independent. The regressors of a delay line are not, and the
+weights diverge earlier: stay below a third of the mean-square bound on real signals. The bound on the mean
 alone is of no use for a Volterra series; it is given for comparison.
 """
 
@@ -27,9 +27,9 @@ from jaxtyping import Array, Bool, Float
 from rotflex_jax.adaptive.moments import Moments, pack, unpack
 from rotflex_jax.errors import InputError
 
-# Up to this many pairs of directions a full eigenvalue decomposition is the quickest.
+# Largest number of pairs of directions for which a full eigenvalue decomposition is the fastest method.
 MOST_DENSE_PAIRS = 700
-# Directions with less than this share of the largest eigenvalue are not excited at all.
+# Directions with less than this share of the largest eigenvalue count as not excited.
 UNEXCITED = 1e-12
 
 
@@ -41,7 +41,7 @@ class MeanSquare:
         mu: step sizes, all positive.
 
     Attributes:
-        values: eigenvalues of R with the step sizes in it, rising; unexcited directions left out.
+        values: eigenvalues of R with the step sizes in it, ascending, without unexcited directions.
         vectors: their directions, in scaled weights (P, r).
         root: square roots of the step sizes (P,).
         along: moments of the regressors, scaled and turned into these directions.
@@ -69,7 +69,7 @@ class MeanSquare:
         if self._dense is None:
             samples = self.along.samples
             assert samples is not None
-            # Blocks of samples, so that their products stay within some 30 MB.
+            # Blocks of samples, so that their products need no more than about 30 MB.
             blocks = np.array_split(samples, -(-len(samples) * self.size // 4_000_000))
             products = (pack(x[:, :, None] * x[:, None, :]) for x in blocks)
             self._dense = sum((p.T @ p for p in products), np.zeros((self.size, self.size))) / len(samples)
@@ -93,7 +93,7 @@ class MeanSquare:
     def radius(self) -> float:
         """Spectral radius of the recursion (c = 1): final decay of the squared errors per sample.
 
-        The recursion keeps covariances covariances, so its eigenvalue of largest size is positive.
+        The recursion maps covariances to covariances, so its eigenvalue of largest size is positive.
         """
         diagonal = 1 - pack_sum(self.values)
         return _largest(
@@ -123,7 +123,7 @@ def pack_sum(values: Float[np.ndarray, " r"]) -> Float[np.ndarray, " D"]:
 
 
 def _largest(size: int, dense: Callable[[], np.ndarray], apply: Callable[[np.ndarray], np.ndarray]) -> float:
-    """Largest eigenvalue of a symmetric operator, by whichever method is quicker."""
+    """Largest eigenvalue of a symmetric operator, by the faster of two methods."""
     from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigsh
 
     if size <= MOST_DENSE_PAIRS:
@@ -147,7 +147,7 @@ def _largest(size: int, dense: Callable[[], np.ndarray], apply: Callable[[np.nda
 
 
 POWER_ITERATIONS = 60
-"""Power iterations for the worst covariance; the error of the bound is the square of its error."""
+"""Number of power iterations for the worst covariance; the error of the bound is the square of its error."""
 
 
 class Margin(eqx.Module):
@@ -155,12 +155,12 @@ class Margin(eqx.Module):
 
         factor = min over C of <C, A(C)> / <C, S(C)>
 
-    At the worst C the quotient does not change to first order with C. So C may be held constant while the
-    derivative is taken, and no eigenvalue needs a derivative of its own.
+    At the worst C the quotient does not depend on C to first order. So C is held constant in derivatives, and
+    no derivative of an eigenvalue is needed.
 
     Args:
-        moments: of the regressors, few enough for S as a matrix.
-        least: factor to be kept; the penalty is zero above it.
+        moments: moments of the regressors, which are few enough for S as a matrix.
+        least: least factor, above which the penalty is zero.
     """
 
     R: Float[Array, "P P"]
@@ -180,7 +180,7 @@ class Margin(eqx.Module):
         self.least = jnp.asarray(float(least))
 
     def penalty(self, mu: Float[Array, "*P"]) -> Float[Array, ""]:
-        """Square of the missing logarithm; zero where the factor is kept."""
+        """Square of the logarithm of `least` over the factor; zero if the factor is above `least`."""
         sizes = jnp.broadcast_to(mu, self.R.shape[:1])
         return jax.nn.relu(jnp.log(self.least) - self.log_factor(sizes)) ** 2
 
@@ -216,7 +216,7 @@ class Margin(eqx.Module):
 
 
 PRACTICAL_MARGIN = 3.0
-"""Factor inside the mean-square bound at which LMS on a tapped delay line was found to be stable."""
+"""Factor inside the mean-square bound with which LMS on a tapped delay line was stable in experiments."""
 
 StepSizes = float | Float[np.ndarray, " P"]
 
@@ -226,11 +226,11 @@ def mean_bound(moments: Moments, direction: StepSizes = 1.0) -> float:
 
         c < 2 / largest eigenvalue of diag(direction) R
 
-    Not a limit to work with: long before it the squares of the weights grow without bound.
+    Not a limit for practice: the squares of the weights grow without bound at much smaller step sizes.
 
     Args:
-        moments: of the regressors.
-        direction: step sizes that are scaled together; with the default the bound on a common one.
+        moments: moments of the regressors.
+        direction: step sizes that the factor multiplies; the default gives the bound on a common step size.
 
     >>> mean_bound(Moments.gaussian(np.eye(5), (1,)))
     2.0
@@ -248,8 +248,8 @@ def mean_square_bound(moments: Moments, direction: StepSizes = 1.0) -> float:
     quadratic regressors of a coloured input.
 
     Args:
-        moments: of the regressors.
-        direction: step sizes that are scaled together; with the default the bound on a common one.
+        moments: moments of the regressors.
+        direction: step sizes that the factor multiplies; the default gives the bound on a common step size.
 
     Source: Feuer and Weinstein 1985, IEEE Trans. ASSP 33, carried over to moments of any regressors.
 
@@ -266,13 +266,13 @@ class Stability:
 
     Attributes:
         mu: step sizes.
-        mean_factor: factor on all of them at which the mean diverges.
+        mean_factor: factor on all step sizes at which the mean diverges.
         factor: factor at which the mean square diverges; below one it already does.
         radius: final factor per sample of the squared weight errors.
         rates: eigenvalues of diag(mu) R, descending: one over the time constants of the modes.
         coefficient_times: samples for which each weight keeps its own error (area under its decay).
-        misadjustment: excess error over the smallest error, in the long run; infinite beyond the bound.
-        small_step: the same by 1/2 sum mu E[phi^2], good below some 4 %.
+        misadjustment: excess error over the smallest error, in steady state; infinite beyond the bound.
+        small_step: approximate misadjustment 1/2 sum mu E[phi^2], which is good below about 4 %.
     """
 
     mu: Float[np.ndarray, " P"]
@@ -291,12 +291,12 @@ class Stability:
 
     @property
     def time_constants(self) -> Float[np.ndarray, " r"]:
-        """Of the mean weights along every mode [samples], ascending."""
+        """Time constants of the mean weights along every mode [samples], ascending."""
         return 1 / self.rates
 
     @property
     def sentence(self) -> str:
-        """Inside or outside the bound, and by how much."""
+        """Whether the step sizes are inside the mean-square bound, and by which factor, in words."""
         if not self.stable:
             return f"outside the mean-square bound: {1 / self.factor:.3g} times too large"
         if self.factor < PRACTICAL_MARGIN:
@@ -322,14 +322,14 @@ class Stability:
 def analyse(moments: Moments, mu: StepSizes) -> Stability:
     """Stability, speed and excess error of LMS with these step sizes.
 
-    Leakage is neglected. Not for NLMS and the like, whose steps depend on the regressors.
+    Leakage is neglected. Not for NLMS and similar filters, whose steps depend on the regressors.
 
     Args:
-        moments: of the regressors.
-        mu: step size, one or one per weight; weights with 0 do not move and count as known.
+        moments: moments of the regressors.
+        mu: step size, one or one per weight; weights with 0 do not change and count as known.
 
     Raises:
-        InputError: step sizes that are negative, not finite, all zero or of the wrong number.
+        InputError: step sizes are negative, not finite or all zero, or their number is wrong.
     """
     exact, moving = recursion(moments, mu)
     sizes = np.zeros(moments.size)
@@ -351,7 +351,7 @@ def analyse(moments: Moments, mu: StepSizes) -> Stability:
 
 
 def recursion(moments: Moments, mu: StepSizes) -> tuple[MeanSquare, Bool[np.ndarray, " P"]]:
-    """The mean-square recursion of the weights that move, and which these are."""
+    """The mean-square recursion of the weights with a positive step size, and the mask of these weights."""
     sizes = step_sizes(moments, mu)
     moving = sizes > 0
     those = moments if moving.all() else moments.transformed(np.eye(moments.size)[:, moving])
@@ -362,7 +362,7 @@ def step_sizes(moments: Moments, mu: StepSizes) -> Float[np.ndarray, " P"]:
     """One step size per weight, checked.
 
     Raises:
-        InputError: they are negative, not finite, all zero or of the wrong number.
+        InputError: step sizes are negative, not finite or all zero, or their number is wrong.
     """
     mu = np.asarray(mu, dtype=float)
     if mu.ndim > 1 or mu.size not in (1, moments.size):

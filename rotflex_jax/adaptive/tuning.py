@@ -49,25 +49,26 @@ def grid(
 ) -> Tuned:
     """The objective of `tune` at every combination of given settings.
 
-    For two settings an alternative to the gradient, which shows the whole objective. Not for four or
-    more: the number of combinations grows exponentially.
+    For one or two settings it is an alternative to the gradient that shows the whole objective. Not for four
+    or more settings: the number of combinations grows exponentially.
 
     Args:
         build: as in `tune`.
-        axes: values to try, by name of the setting.
+        axes: name of a setting -> values to try.
         basis: as in `tune`.
         recordings: as in `tune`.
         channel: as in `tune`.
         objective: as in `tune`.
         test: as in `tune`.
-        devices: that share the combinations; all of this process unless given. With
-            `jax.distributed`, `jax.devices()` are those of all processes, of which each makes this call.
+        devices: devices that share the combinations; by default all devices of this process. With
+            `jax.distributed`, `jax.devices()` are the devices of all processes, and each process makes this
+            call.
 
     Returns:
-        The best combination, with the values at all.
+        The best combination, with the objective at all combinations.
 
     Raises:
-        InputError: as `tune`; no settings, or a filter that diverges with all of them.
+        InputError: as in `tune`; there are no settings, or the filter diverges with all combinations.
     """
     tried = {name: np.atleast_1d(np.asarray(values, dtype=float)) for name, values in axes.items()}
     if not tried or any(v.ndim != 1 or not v.size for v in tried.values()):
@@ -119,33 +120,33 @@ def tune(
 
         log objective(exp(x)) -> min over x,   forward derivatives through every step of the filter
 
-    Quasi-Newton steps of limited length from all starts at once. Where the filter diverges a step is
-    shortened. Any leaf of the filter can be tuned,
-    and poles of the basis as well; more than some ten settings make forward derivatives slow.
+    Quasi-Newton steps of limited length are made from all starts at once. If the filter diverges, a step is
+    shortened. Any leaf of the filter can be tuned, and poles of the basis as well. With more than about ten
+    settings, forward derivatives become slow.
 
-    Not for a single recording, to whose noise the settings would be fitted: give several.
+    Not for a single recording, since the settings would be fitted to its noise: give several recordings.
 
     Args:
-        build: the filter of settings by name, such as `lambda s: LMS(s["mu"])`; JAX traces it. For poles
-            it returns the filter and a basis, such as `Volterra(bank.with_numbers(...))`.
-            The same function in another call compiles nothing again.
-        start: settings to begin with, or several sets of them.
-        basis: turns the input into regressors.
-        recordings: to tune on, of one length; the filter starts again on each.
-        channel: output to be followed.
-        objective: "final", "mean_error" or "last_half"; they ask for different settings.
-        test: other recordings, on which the result is evaluated by the same objective.
-        ranges: of settings by name; a range with an end moves along a logistic curve, every other
-            setting is positive and moves along its logarithm.
-        evaluations: most filters to run per start, each with all derivatives.
-        margin: keep at least this factor inside the mean-square bound of LMS, as a penalty; 0 for none.
+        build: function of settings by name that returns the filter, such as `lambda s: LMS(s["mu"])`; JAX
+            traces it. To tune poles, it returns the filter and a basis, such as
+            `Volterra(bank.with_numbers(...))`. Another call with the same function needs no compilation.
+        start: first settings, or several sets of first settings.
+        basis: basis that gives the regressors of the input.
+        recordings: recordings for tuning, of one length; the filter starts again on each.
+        channel: output of the filter.
+        objective: "final", "mean_error" or "last_half"; each has a different optimum.
+        test: other recordings, on which the result is evaluated with the same objective.
+        ranges: name of a setting -> its range, which is 0 to infinity by default. A range with a finite upper
+            end is transformed by a logistic function, any other by the logarithm above its lower end.
+        evaluations: most runs of the filter per start, each with all derivatives.
+        margin: least factor inside the mean-square bound of LMS, kept by a penalty; 0 for none.
 
     Returns:
         The best of all starts, with every path and a check of its stability.
 
     Raises:
-        InputError: settings out of range, an unknown objective, recordings that do not go together, or
-            a filter that diverges from every start.
+        InputError: settings are out of range, the objective is unknown, recordings differ in length or
+            sampling period, or the filter diverges from every start.
     """
     count("evaluations", evaluations)
     starts = starting_sets(start)
@@ -192,7 +193,7 @@ def tune(
         data,
         objective=objective,
         test=test,
-        # With a margin the last value includes the penalty.
+        # With a margin, the last value includes the penalty and is not the objective.
         value=float(best.values[-1]) if guard is None else None,
         evaluations=sum(p.evaluations for p in paths),
         paths=paths,
@@ -209,10 +210,10 @@ def loss_and_slopes(
     build: FilterBuilder,
     objective: Objective,
 ) -> tuple[Float[Array, " S"], Float[Array, "S n"]]:
-    """Log of the objective, and its derivatives with respect to the unconstrained coordinates.
+    """Logarithm of the objective, and its derivatives with respect to the unconstrained coordinates.
 
-    Forward mode: as many tangents as settings, and nothing of the run is stored. Compiled once per `build`,
-    whatever the values are.
+    In forward mode there are as many tangents as settings, and the run is not stored. The function is
+    compiled once for each `build`.
     """
 
     def loss(x: Float[Array, " n"]) -> tuple[Float[Array, ""], Float[Array, ""]]:

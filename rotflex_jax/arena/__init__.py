@@ -1,21 +1,21 @@
-"""The arena: recordings of a known truth, on which methods that look for missing effects are scored.
+"""The arena: recordings with a known truth, on which methods that search for missing effects are scored.
 
     rf.arena.score("my_method.py:answer", records=12, seed=7)
 
 A method is a function from training and validation recordings to an answer: names of effects, "nothing
 missing" or "unexplained". It sees neither truth nor seed.
 
-* `scores` - scores of methods on records drawn from a seed; `problems` draws them;
-* `method` - what a method is given and may answer, in a process of its own;
-* `entrants` - methods that come with the arena; `rivals` and `evolution` are what they rest on;
-* `marking` - one answer beside what was hidden;
-* `simulator` - the independent simulator; `wrong_worlds` - machines that are wrong in more ways than one;
-* `measured` - every direction of the measured machines.
+* `scores` - scores of methods on records that are drawn from a seed; `problems` draws them;
+* `method` - input and possible answers of a method, which runs in a separate process;
+* `entrants` - methods of the arena itself; they use `rivals` and `evolution`;
+* `marking` - compares an answer with the hidden effects;
+* `simulator` - the independent simulator; `wrong_worlds` - machines whose model has several errors;
+* `measured` - the measured machines, with all directions of fit and test.
 """
 
 import lazy_loader
 
-# The simulator needs numba and the entrants JAX; a name is loaded when it is asked for.
+# The simulator needs numba, and the entrants need JAX; a name is loaded when it is used.
 __getattr__, __dir__, __all__ = lazy_loader.attach(
     __name__,
     submod_attrs={

@@ -1,4 +1,4 @@
-"""Methods of the arena itself: the search, regressions, refits, evolution; called like a user's method."""
+"""Methods of the arena itself: search, regressions, refits, evolution; called like a method of a user."""
 
 import functools
 from collections.abc import Callable, Sequence
@@ -19,10 +19,10 @@ Given = dict[str, Any]
 
 @dataclass(frozen=True)
 class Entrant:
-    """A method that comes with the arena.
+    """A method of the arena itself.
 
     Attributes:
-        title: What it is, in a line.
+        title: Description in one line.
         method: The method.
     """
 
@@ -46,9 +46,9 @@ def search(train: Recordings, validation: Recordings, model: Model) -> Given:
 
 
 def _named(find: Callable[[], Any], train: Recordings, validation: Recordings, model: Model) -> Given:
-    """What a method of `rivals` names; the grey box fits the structure, so that its arithmetic is not scored.
+    """Effects named by a method of `rivals`; the grey box fits this structure, and only this fit is scored.
 
-    Such a method has columns for a joint of two angles, and one recording of each kind.
+    Such a method is made for a joint with two angles, and for one recording of each kind.
     """
     if model.mechanism.channels != ("theta", "alpha") or len(train) != 1 or len(validation) != 1:
         raise InputError(
@@ -57,7 +57,7 @@ def _named(find: Callable[[], Any], train: Recordings, validation: Recordings, m
         )
     from rotflex_jax.fit import fit
 
-    with threadpool_limits(1):  # small matrices: several threads mostly wait for one another
+    with threadpool_limits(1):  # for small matrices, several threads mostly wait for each other
         answer = find()(train[0], validation[0])
     structure = model
     for name, port in answer.rounds:
@@ -84,7 +84,7 @@ def _of_rivals(name: str) -> Callable[[], Any]:
 
 
 def evolution(train: Recordings, validation: Recordings, model: Model) -> Given:
-    """CMA-ES over the catalogue: all effects at once in one model, then what is not needed leaves."""
+    """CMA-ES over the catalogue: all effects in one model, from which effects not needed are removed."""
     from rotflex_jax.arena.evolution import evolved
 
     return evolved(train, validation, model)
@@ -105,4 +105,4 @@ ENTRANTS: dict[str, Entrant] = {
     "sindy_weak": Entrant("the same in weak form", functools.partial(_named, _of_sindy("weak"))),
     "cma_es": Entrant("CMA-ES over the parameters of many effects at once, then pruned", evolution),
 }
-"""By the name under which `rotflex arena` knows them."""
+"""Name in `rotflex arena` -> entrant."""

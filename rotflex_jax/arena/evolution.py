@@ -28,13 +28,13 @@ Cost = Callable[[Float[np.ndarray, "points n"]], Float[np.ndarray, " points"]]
 
 
 class Evolved(NamedTuple):
-    """What the evolution ended with.
+    """Result of the evolution.
 
     Attributes:
         x: Best point, within the box.
-        cost: Its cost.
-        evaluations: Costs that were computed.
-        restarts: How often it began again.
+        cost: Cost of this point.
+        evaluations: Number of costs that were computed.
+        restarts: Number of restarts.
     """
 
     x: Float[np.ndarray, " n"]
@@ -53,17 +53,17 @@ def minimise(
 ) -> Evolved:
     """The least cost within a box.
 
-    The search runs in the unit cube; points outside of it are evaluated at the nearest point inside and
-    ranked with a penalty of the squared distance. It begins again, at another place and with twice as many
-    points, where the cost no longer falls.
+    The search runs in the unit cube. Points outside of it are evaluated at the nearest point inside and
+    ranked with a penalty on the squared distance. When the cost no longer falls, the search restarts at
+    another point with twice as many points per generation.
 
     Args:
-        cost: To be minimised, of many points at once.
+        cost: Function to minimise, evaluated at many points at once.
         lower: Least values.
         upper: Largest values.
-        evaluations: Costs to compute at most.
-        seed: Of the random numbers.
-        start: Where the first run begins; the middle of the box if None.
+        evaluations: Largest number of costs to compute.
+        seed: Seed of the random numbers.
+        start: Point at which the first run begins; the middle of the box if None.
     """
     random, n = np.random.default_rng(seed), len(lower)
     base = 4 + int(3 * np.log(n))
@@ -88,7 +88,7 @@ def _one(
     random: np.random.Generator,
     first: np.ndarray,
 ) -> tuple[np.ndarray, float, int]:
-    """One run: the best point of the unit cube, its cost, and how many costs were computed."""
+    """One run: the best point in the unit cube, its cost, and the number of costs that were computed."""
     n, half = len(lower), size // 2
     w = np.log(half + 0.5) - np.log(np.arange(1, half + 1))
     w = w / w.sum()
@@ -138,8 +138,8 @@ def _one(
     return best, best_cost, used
 
 
-# Left out of the evolution: what another effect of the list is a special case or nearly a copy of, and what
-# needs a shape of its own to be found by any box (two-mass play, oscillators).
+# Effects that are left out of the evolution: those that contain another effect or nearly equal one, and those
+# whose shape cannot be found within a fixed box (play with two masses, oscillators).
 _LEFT_OUT = frozenset(
     {
         "backlash",
@@ -154,22 +154,22 @@ _LEFT_OUT = frozenset(
         "periodic_disturbance",
     }
 )
-# Points that are run at a time; one program serves all numbers of points.
+# Number of points in one call of the compiled program, which serves any number of points.
 _LANES = 16
 WINDOW = 2.0
-"""Length of the free runs that it fits [s]."""
+"""Length of the free runs that are fitted [s]."""
 
-# Costs of the first evolution and of each one after effects were left out, and how many effects may be named.
+# Evaluations in the first evolution, and in each later one; largest number of named effects.
 FIRST, AGAIN, MOST = 3200, 800, 4
-# Without an effect that stays, the sum of the logarithms of mean squares over validation data rises so much.
+# An effect is kept if, without it, the sum of log mean squares over validation data rises by this.
 NEEDED = 0.04
-# Bounds: what a fit has free is within these factors of the start, an effect's parameters of their sizes.
+# Bounds: factors of the start values for free parameters of the model; for effects, factors of typical sizes.
 _FREE, _AMPLITUDE, _SHAPE = (0.5, 2.0), 3.0, (0.4, 2.5)
 _DAMPER = 0.02
 
 
 def _with_catalogue(model: Model) -> Model:
-    """The model with many effects of the catalogue, all switched on."""
+    """The model with many effects of the catalogue added."""
     found = model
     for kind, port in search_places(model.mechanism):
         known = [(e.name, e.at) for e in model.mechanism.effects]
@@ -204,7 +204,7 @@ def _box(model: Model, whole: Model) -> tuple[np.ndarray, np.ndarray]:
 
 
 class _Runs(NamedTuple):
-    """Windows of recordings: voltages (W, L), outputs (W, L, C), first states (W, n), samples not counted."""
+    """Windows of recordings: voltages (W, L), outputs (W, L, C), first states (W, n), unscored samples."""
 
     u: np.ndarray
     y: np.ndarray
@@ -214,7 +214,7 @@ class _Runs(NamedTuple):
 
     @classmethod
     def of(cls, recordings: Sequence[Recording], fitted: Model, whole: Model, count: int = 0) -> _Runs:
-        """Those of recordings, repeated up to a number of windows that a program was compiled for."""
+        """The windows of recordings, repeated up to the number for which a program was compiled."""
         rest = rest_state(whole.mechanism.structure, np.float64)
         u, y, first = [], [], []
         for r in recordings:
@@ -239,7 +239,7 @@ class _Runs(NamedTuple):
 
 @functools.cache
 def _squares_of_many(structure: Mechanism, solver: Solver) -> Callable[..., Any]:
-    """Sums of squares of many points, over all windows; compiled once for a machine."""
+    """Function for the sums of squares of many points in all windows; compiled once for a machine."""
 
     def squares(values, gates, x0, u, y, Ts, seen):  # noqa: ANN001, ANN202 - traced
         e = (y - free_run(structure, solver, values, gates, x0, u, Ts)[1]) * seen[:, None]
@@ -250,18 +250,19 @@ def _squares_of_many(structure: Mechanism, solver: Solver) -> Callable[..., Any]
 
 
 def evolved(train: Sequence[Recording], validation: Sequence[Recording], model: Model) -> dict[str, Any]:
-    """All effects at once in one model, its parameters by CMA-ES on short free runs, less what is not needed.
+    """Fits all effects at once in one model, by CMA-ES on short free runs, and removes effects not needed.
 
-    Without each effect in turn the error on validation data says whether it is needed. Those that are not are
-    switched off, three times; after the first two the evolution goes on with the others.
+    Each effect in turn is left out; the error on validation data then shows whether it is needed. Effects
+    that are not needed are switched off. This is done three times, and after the first two the evolution
+    continues with the other effects.
 
     Args:
         train: Recordings to fit.
-        validation: Recordings to decide on.
+        validation: Recordings for decisions.
         model: The textbook model.
 
     Returns:
-        `effects` and `model`, as a method of the arena answers.
+        `effects` and `model`, as in an answer of a method of the arena.
     """
     whole = _with_catalogue(model)
     mechanism, base = whole.mechanism, len(model.mechanism.effects)
@@ -288,7 +289,7 @@ def evolved(train: Sequence[Recording], validation: Sequence[Recording], model: 
 
         on = np.ones(len(mechanism.effects))
         point = (lower + upper) / 2
-        # Every effect begins small, so that the first runs are those of the textbook model.
+        # Every effect begins small, so that the first runs are nearly those of the textbook model.
         small = of_effect >= base
         point[small] = np.clip(0.0, lower, upper)[small] + 0.02 * (upper - lower)[small]
         point[~small] = np.clip(first[place], lower, upper)[~small]

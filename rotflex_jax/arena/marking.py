@@ -1,4 +1,4 @@
-"""Compares what a search answered with what was hidden; knows names, not methods."""
+"""Compares an answer with the hidden effects, by names; independent of the methods."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from rotflex_jax.arena.simulator.plant import Plant
 from rotflex_jax.effects.base import full_name
 from rotflex_jax.text.numbers import json_number
 
-# Arena's parameter -> the parameters of the same effect in the package.
+# Effect -> parameter in the arena -> parameters of the same effect in the package.
 _RENAMED: dict[str, dict[str, tuple[str, ...]]] = {
     "coulomb_asymmetric": {"level_plus": ("forward",), "level_minus": ("backward",)},
     "quadratic_spring": {"coefficient": ("stiffness",)},
@@ -23,15 +23,15 @@ _RENAMED: dict[str, dict[str, tuple[str, ...]]] = {
 
 
 def renamed(place: Place, values: Mapping[str, float], K: float = Plant.K) -> dict[str, float]:
-    """An effect's parameters under the package's names.
+    """Parameters of an effect under the names of the package.
 
     Args:
         place: name and port.
-        values: parameters under the arena's names.
-        K: stiffness of the plant's joint [N m/rad], which play takes away.
+        values: parameters under the names of the arena.
+        K: stiffness of the joint [N m/rad], which is missing within a play.
 
     Returns:
-        Parameter names and values as `rotflex_jax.effects` has them.
+        Parameter names and values as in `rotflex_jax.effects`.
     """
     if place[0] == "gravity":  # -m sin(z + phase), expanded
         m, phase = values["moment"], values["phase"]
@@ -52,19 +52,19 @@ def renamed(place: Place, values: Mapping[str, float], K: float = Plant.K) -> di
 
 
 def visible(hidden: Iterable[Place], kind: str, channels: Sequence[str] = ("theta", "alpha")) -> list[Place]:
-    """The hidden effects that a textbook joint lacks and this input and these sensors can show."""
+    """The hidden effects that the textbook joint lacks and that this input and these sensors can show."""
     missing = {"theta", "alpha"} - set(channels)
     seen = [p for p in hidden if p not in ABSORBED and kind not in UNSEEN.get(p, set())]
     return [p for p in seen if p[1] not in missing]
 
 
 def alike(place: Place) -> set[Place]:
-    """The effect itself and its documented look-alikes."""
+    """The effect itself and its documented equivalents."""
     return {place} | EQUIVALENT.get(place, set())
 
 
 def exact(answer: Iterable[Place], wanted: Sequence[Place]) -> bool:
-    """Whether the answer is the truth, or the truth written with all look-alikes instead."""
+    """Whether the answer is the truth, where an effect may be replaced by all of its equivalents."""
     got = set(answer)
     options = [set[Place]()]
     for place in wanted:
@@ -84,15 +84,16 @@ def scored(
     Args:
         wanted: effects that should be found.
         rounds: effects that were found, in order.
-        equivalents: for each of them, what it was said to be mistaken for.
-        verdict: the end state in one word.
+        equivalents: for each of these, the effects that were reported as equivalent.
+        verdict: the verdict in one word.
 
     Returns:
-        `first`: the first effect is true, look-alikes allowed; `strict`: true by name; `exact`: the
-        whole set; `inside`: every true effect is found or listed; `hits`: how many are; `set_size`: the
-        largest set that a round was reported as; `extra`: effects that are neither
-        true nor look-alikes; `verdict_right`, which for an effect outside the package is that
-        something remains unexplained; `outside`: whether there was one.
+        `first`: whether the first effect is true, or an equivalent of a true one; `strict`: whether it is
+        true by name; `exact`: whether the whole set is true; `inside`: whether every true effect is found or
+        listed as equivalent; `hits`: how many are; `set_size`: size of the largest set of equivalent effects;
+        `extra`: effects that are neither true nor equivalents of true ones; `verdict_right`: whether the
+        verdict is right, which for an effect outside the package is `unexplained`; `outside`: whether there
+        is such an effect.
     """
     listed = set(rounds) | {p for group in equivalents for p in group}
     allowed = {p for place in wanted for p in alike(place)}
@@ -120,18 +121,18 @@ def scored(
 def parameter_errors(
     hidden: Mapping[Place, Mapping[str, float]], estimates: Mapping[str, Any], K: float = Plant.K
 ) -> dict[str, dict[str, Any]]:
-    """True values beside the estimates of the same full name; effects not found are left out.
+    """True values and estimates of the parameters with the same full name; effects not found are left out.
 
-    So are effects that only add to a constant of the baseline: they have no number of their own.
+    Effects that only add to a constant of the baseline are left out too: they have no separate estimate.
 
     Args:
-        hidden: parameters under the arena's names.
-        estimates: full name `port.effect.parameter` -> object with `value` and `ci95`.
-        K: stiffness of the plant's joint [N m/rad].
+        hidden: parameters under the names of the arena.
+        estimates: full name `port.effect.parameter` -> object with `value`, `std` and `ci95`.
+        K: stiffness of the joint [N m/rad].
 
     Returns:
-        Full name -> true value, estimate with its standard deviation, error [%], whether the 95 % interval
-        holds the truth.
+        Full name -> true value, estimate with its standard deviation, error [%], and whether the 95 %
+        interval contains the true value.
     """
     table = dict[str, dict[str, Any]]()
     for place, values in hidden.items():

@@ -1,4 +1,4 @@
-"""Every measured machine: its model, and all ways to fit some recordings and evaluate on others."""
+"""The measured machines: their models, and all ways to fit some recordings and evaluate on others."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from typing import Any
 import rotflex_jax as rf
 from rotflex_jax.data.readers import stages_together
 
-# Share of a run for training, the rest is for validation.
+# Share of a run for training; the rest is for validation.
 SHARE = 0.7
-# A quarter of the Silverbox's training record is plenty for three or four effects, as in B3.
+# A quarter of the training record of the Silverbox suffices for three or four effects, as in benchmark B3.
 SILVERBOX_SAMPLES = 16_000
 
 
@@ -21,9 +21,9 @@ class Way:
     """Which recordings are fitted, which decide, and on which the result is evaluated.
 
     Args:
-        name: of the direction.
+        name: name of the direction.
         train: recordings to fit.
-        validation: recordings that decide.
+        validation: recordings for decisions.
         test: recordings used for no fit and no choice.
     """
 
@@ -40,12 +40,12 @@ class Machine:
     Args:
         dataset: name in the registry.
         preset: name of its mechanism in `rotflex_jax.joints`.
-        directions: recordings of the data set to all directions.
-        options: of the preset.
-        unit: of the errors that are reported.
-        factor: errors in that unit per unit of the channel.
-        solver: integration rule, where it is not the usual one.
-        with_signals: whether its recordings have signals beside the input.
+        directions: function from the recordings of the data set to all directions.
+        options: options of the preset.
+        unit: unit of the errors that are reported.
+        factor: factor from the unit of the channel to this unit.
+        solver: integration rule, if it is not the default.
+        with_signals: whether its recordings have signals in addition to the input.
         released: trusted parameters of the mechanism whose values are not known for its recordings.
     """
 
@@ -65,33 +65,34 @@ class Machine:
         return rf.Model(mechanism) if self.solver is None else rf.Model(mechanism, self.solver)
 
     def ways(self) -> list[Way]:
-        """All directions; needs the recordings."""
+        """All directions; this loads the recordings."""
         return self.directions(rf.data.load_dataset(self.dataset))
 
 
 def learnt(name: str, runs: Sequence[rf.Recording], test: Sequence[rf.Recording]) -> Way:
-    """Fitted to the beginnings of runs, whose ends decide, and evaluated on other recordings."""
+    """Fit to the beginnings of runs, validation on their ends, and evaluation on other recordings."""
     parts = [r.split(SHARE) for r in runs]
     return Way(name, tuple(a for a, _ in parts), tuple(b for _, b in parts), tuple(test))
 
 
 def halves(run: rf.Recording) -> Way:
-    """Learnt from the first half of a run and evaluated on the second."""
+    """Learn from the first half of a run and evaluate on the second half."""
     first, second = run.split(0.5)
     return learnt("first half to second half", [first], [second])
 
 
 def together(runs: Sequence[rf.Recording]) -> Way:
-    """Learnt from the beginnings of all runs and evaluated on their ends."""
+    """Learn from the beginnings of all runs and evaluate on their ends."""
     parts = [r.split(SHARE) for r in runs]
     return learnt(f"first {100 * SHARE:g} % of all to the rest", [a for a, _ in parts], [b for _, b in parts])
 
 
 def crossed(runs: Mapping[str, rf.Recording]) -> list[Way]:
-    """From each run to the others, then all together.
+    """From each run to the others, then all runs together.
 
-    Of two runs, the end of the first one decides and the other one is the test, or the first half of the
-    other one decides and its second half is the test. Of three, the next one decides, the third is the test.
+    With two runs, the end of the first is for validation and the other run is the test; or the first half of
+    the other run is for validation and its second half is the test. With three runs, the next one is for
+    validation and the third is the test.
     """
     names, ways = list(runs), list[Way]()
     for k, name in enumerate(names):
@@ -109,7 +110,7 @@ def crossed(runs: Mapping[str, rf.Recording]) -> list[Way]:
 
 
 def _emps(_: list[rf.Recording]) -> list[Way]:
-    # The test record has pulses of the voltage, which the training record lacks. It is for the errors only.
+    # The test record has force pulses, which the training record lacks. It is used for the errors only.
     official = rf.data.benchmark("emps")
     return [
         learnt("official", [official.train], list(official.tests.values())),
@@ -124,24 +125,24 @@ def _silverbox(_: list[rf.Recording]) -> list[Way]:
 
 
 def by_itself(name: str, run: rf.Recording) -> Way:
-    """Learnt from the first half of a run, decided on what follows and evaluated on its end."""
+    """Learn from the first half of a run, validate on the part after it, and evaluate on the end."""
     train, rest = run.split(0.5)
     decides, tests = rest.split(2 * SHARE - 1)
     return Way(f"{name}, first half to its end", (train,), (decides,), (tests,))
 
 
 def _two_runs(runs: Sequence[rf.Recording]) -> list[Way]:
-    """Two runs of the serial link, by LQR and by full state feedback: each by itself, and across.
+    """Two runs of the serial link, with LQR and with state feedback: each run alone, and across the runs.
 
-    They are fifteen years apart, with other friction and amplifiers: a run by itself shows what a model can
-    do, while across the runs the machine has changed as well.
+    The runs are fifteen years apart, with different friction and amplifiers. A single run shows what a model
+    can do; across the runs the machine has changed as well.
     """
     named: dict[str, rf.Recording] = dict(zip(("lqr", "feedback"), runs, strict=True))
     return [*(by_itself(name, run) for name, run in named.items()), *crossed(named)]
 
 
 def _stage(stage: int, beside_the_other: bool) -> Callable[[list[rf.Recording]], list[Way]]:
-    """One stage of the serial link, with the acceleration of the other link as a signal or without it."""
+    """One stage of the serial link, with or without the acceleration of the other link as a signal."""
 
     def ways(runs: list[rf.Recording]) -> list[Way]:
         own = runs[stage - 1 :: 2]
@@ -156,7 +157,7 @@ def _both_stages(runs: list[rf.Recording]) -> list[Way]:
 
 
 def _by_gain(runs: list[rf.Recording]) -> list[Way]:
-    """Servo with four gains, three motions each: the lower gains to the highest, and back."""
+    """Servo with four gains and three motions for each: from the lower gains to the highest, and back."""
     low, high = runs[:9], runs[9:]
     return [
         learnt("gains 100 to 400 to gain 800", low, high),
@@ -165,7 +166,7 @@ def _by_gain(runs: list[rf.Recording]) -> list[Way]:
 
 
 def _elbow(runs: list[rf.Recording]) -> list[Way]:
-    """One servo of the arm: random motion to steps, and back."""
+    """One servo of the arm: from random motion to steps, and back."""
     own = {r.source.split(",")[0]: r for r in runs if ", Elbow" in r.source}
     random = [own["multisine"], own["prbs_excitation"]]
     return [

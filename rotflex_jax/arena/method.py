@@ -1,4 +1,4 @@
-"""A method under test: what it is given, what it may answer, and a process of its own to run it in."""
+"""A method under test: its input, its possible answers, and a separate process in which it runs."""
 
 import contextlib
 import inspect
@@ -32,26 +32,26 @@ Method = Callable[..., Any]
 
 NOTHING_MISSING, UNEXPLAINED = "nothing missing", "unexplained"
 _KEYS = ("effects", "unexplained", "probabilities", "model")
-# By so much a sum of probabilities may exceed one.
+# Amount by which a probability may exceed one because of rounding.
 _ROUNDING = 1e-9
-# What a process may take to start, to import and to run a model [s].
+# Time that a process may take to start and import, or to run a model [s].
 _STARTING = 300.0
 
 
 class ArenaFailure(Exception):
-    """A method that gave no answer, with a sentence why."""
+    """A method gave no answer; the message is a sentence with the reason."""
 
 
 @dataclass(frozen=True)
 class Answer:
-    """What a method said of a record.
+    """The answer of a method on a record.
 
     Attributes:
-        effects: What is missing, by name and port.
-        unexplained: Whether it says that something remains that it has no name for.
-        probabilities: Effect at a port -> probability that it is there.
-        has_model: Whether there is a model to run.
-        seconds: What it took.
+        effects: Missing effects, by name and port.
+        unexplained: Whether the method states that something remains unexplained.
+        probabilities: Effect at a port -> probability that it is present.
+        has_model: Whether the answer includes a model to run.
+        seconds: Time that the answer took [s].
     """
 
     effects: tuple[Place, ...] = ()
@@ -62,10 +62,10 @@ class Answer:
 
 
 def place_of(given: Any, model: Model) -> Place:
-    """An effect and its port, of `"coulomb@hub"` or `("coulomb", "hub")`.
+    """An effect and its port, from `"coulomb@hub"` or `("coulomb", "hub")`.
 
     Raises:
-        InputError: No effect of the catalogue, or no port that it can act at.
+        InputError: The effect is not in the catalogue, or cannot act at the port.
     """
     pair = tuple(given.split("@")) if isinstance(given, str) else given
     if not (isinstance(pair, tuple | list) and len(pair) == 2 and all(isinstance(x, str) for x in pair)):
@@ -88,15 +88,15 @@ def place_of(given: Any, model: Model) -> Place:
 
 
 def understood(given: Any, model: Model) -> tuple[Answer, Any]:
-    """The answer and the model in what a method returned.
+    """The answer and the model in the return value of a method.
 
     Args:
-        given: "nothing missing", "unexplained", a list of effects, or a mapping with `effects` and, where
-            wanted, `unexplained`, `probabilities` and `model`.
-        model: The textbook model that the method was given.
+        given: "nothing missing", "unexplained", a list of effects, or a mapping with `effects` and optionally
+            `unexplained`, `probabilities` and `model`.
+        model: The textbook model that the method received.
 
     Raises:
-        InputError: It is none of these.
+        InputError: The return value is none of these.
     """
     if isinstance(given, str):
         words = {NOTHING_MISSING: {"effects": []}, UNEXPLAINED: {"unexplained": True}}
@@ -152,13 +152,13 @@ def understood(given: Any, model: Model) -> tuple[Answer, Any]:
 
 
 def called(method: Method, train: list[Recording], validation: list[Recording], model: Model) -> Any:
-    """What a method returns; it gets the textbook model where it has a third argument."""
+    """The return value of a method, which receives the textbook model if it has a third argument."""
     try:
         parameters = list(inspect.signature(method).parameters.values())
     except (TypeError, ValueError):
         parameters = []
     by_place = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
-    # An argument with a default of its own is not meant for the model, unless it is called so.
+    # An argument with a default value is not meant for the model, unless its name is `model`.
     needed = [
         p
         for p in parameters
@@ -169,10 +169,10 @@ def called(method: Method, train: list[Recording], validation: list[Recording], 
 
 
 def simulated(model: Any, recordings: list[Recording]) -> list[Float[np.ndarray, "_ C"]]:
-    """Free runs of an answered model.
+    """Free runs of the model in an answer.
 
     Raises:
-        InputError: A run has not the shape of its recording.
+        InputError: A run does not have the shape of its recording.
     """
     runs = []
     for r in recordings:
@@ -196,7 +196,7 @@ def _said(problem: BaseException) -> str:
 
 
 class Here:
-    """A method in this process: for functions of the caller's own. A limit of time is told afterwards."""
+    """A method in this process, for functions of the caller; the time limit is checked only afterwards."""
 
     def __init__(self, method: Method) -> None:
         self.method, self.model = method, None
@@ -211,7 +211,7 @@ class Here:
         """The answer to a record.
 
         Raises:
-            ArenaFailure: There is none.
+            ArenaFailure: There is no valid answer.
         """
         self.model = None
         train, validation, model = pickle.loads(given)
@@ -230,7 +230,7 @@ class Here:
         """Free runs of the model of the last answer.
 
         Raises:
-            ArenaFailure: It does not run.
+            ArenaFailure: The model does not run.
         """
         try:
             return simulated(self.model, pickle.loads(asked))
@@ -243,9 +243,10 @@ def _late(limit: float) -> str:
 
 
 class Apart:
-    """A method in a process of its own, which knows recordings and nothing else.
+    """A method in a separate process, which receives recordings and nothing else.
 
-    It can be stopped at any moment and take down nothing with it; the next record gets a new process then.
+    The process can be stopped at any time without affecting anything else; the next record then gets a new
+    process.
 
     Args:
         name: `FILE.py:NAME`, or an entrant of `rotflex_jax.arena`.
@@ -266,7 +267,7 @@ class Apart:
     def _stop(self) -> None:
         process, self.process = self.process, None
         if process is not None:
-            # With all that the method started itself; macOS refuses a group of which only the dead are left.
+            # Including all processes that the method started; macOS refuses a group without live processes.
             if hasattr(os, "killpg"):
                 with contextlib.suppress(ProcessLookupError, PermissionError):
                     os.killpg(process.pid, signal.SIGKILL)
@@ -278,10 +279,10 @@ class Apart:
                         pipe.close()
 
     def _start(self) -> None:
-        """A process that has imported the method.
+        """Start a process and let it import the method.
 
         Raises:
-            InputError: It cannot be imported.
+            InputError: The method cannot be imported.
         """
         root = str(Path(__file__).resolve().parents[2])
         path = os.pathsep.join(p for p in (root, os.environ.get("PYTHONPATH", "")) if p)
@@ -291,7 +292,7 @@ class Apart:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             env={**os.environ, "PYTHONPATH": path},
-            start_new_session=True,  # a group of its own, to be stopped as a whole
+            start_new_session=True,  # a separate process group, which can be stopped as a whole
         )
         self.replies = queue.Queue()
         assert self.process.stdout is not None
@@ -318,7 +319,7 @@ class Apart:
             except (InputError, OSError) as problem:
                 if not self.started:
                     raise
-                # It could be imported once: what is wrong now is of this record, and others may go on.
+                # The import worked before, so the failure concerns only this record; others may continue.
                 raise ArenaFailure(f"The process of the method does not start again: {problem}") from problem
         process = self.process
         assert process is not None and process.stdin is not None
@@ -336,16 +337,16 @@ class Apart:
         return value
 
     def begin(self) -> None:
-        """Import the method, so that what is wrong with it is said before any record.
+        """Import the method, so that its errors are reported before any record.
 
         Raises:
-            InputError: It cannot be imported.
+            InputError: The method cannot be imported.
         """
         if self.process is None:
             self._start()
 
     def answer(self, given: bytes, limit: float) -> Answer:
-        """As `Here.answer`, but whatever takes too long is stopped."""
+        """As `Here.answer`, but a method that takes too long is stopped."""
         return self._ask(("answer", given), limit)
 
     def simulate(self, asked: bytes) -> list[Float[np.ndarray, "_ C"]]:
@@ -370,7 +371,7 @@ def _receive(pipe: IO[bytes]) -> Any:
 
 
 def _listen(pipe: IO[bytes], replies: "queue.Queue[tuple[str, Any]]") -> None:
-    """Passes on what a process says until it ends."""
+    """Passes on the messages of a process until it ends."""
     with contextlib.suppress(OSError, ValueError, EOFError, pickle.UnpicklingError):
         while (message := _receive(pipe)) is not None:
             replies.put(message)
@@ -378,10 +379,10 @@ def _listen(pipe: IO[bytes], replies: "queue.Queue[tuple[str, Any]]") -> None:
 
 
 def check_name(name: str) -> None:
-    """Refuse a name that is neither an entrant nor that of a function of a file.
+    """Refuse a name that is neither an entrant nor the name of a function in a file.
 
     Raises:
-        InputError: It is neither.
+        InputError: The name is neither.
     """
     from rotflex_jax.arena.entrants import ENTRANTS  # on request: it names methods
 
@@ -393,10 +394,10 @@ def check_name(name: str) -> None:
 
 
 def loaded(name: str) -> Method:
-    """The method meant by `FILE.py:NAME`, `package.module:NAME` or the name of an entrant.
+    """The method of `FILE.py:NAME`, `package.module:NAME` or the name of an entrant.
 
     Raises:
-        InputError: There is none, or it is no function.
+        InputError: There is no such method, or it is no function.
     """
     from rotflex_jax.arena.entrants import ENTRANTS
     from rotflex_jax.joints.by_name import imported
@@ -412,7 +413,7 @@ def loaded(name: str) -> Method:
 
 
 def serve() -> None:
-    """The process of a method: answers until its input ends. What the method prints goes to stderr."""
+    """Main function of the process of a method: answers until its input ends; prints go to stderr."""
     answers, questions = os.fdopen(os.dup(1), "wb"), os.fdopen(os.dup(0), "rb")
     os.dup2(2, 1)
     with open(os.devnull) as nothing:

@@ -1,4 +1,4 @@
-"""The page of an arena: the table of methods, and every answer beside the truth."""
+"""The page of an arena: the table of methods, and every answer with the truth."""
 
 from pathlib import Path
 from typing import Any
@@ -23,12 +23,12 @@ HEADINGS = {
 
 
 def write(scores: Scores, path: str | Path) -> Path:
-    """Write the page as one file; returns its path."""
+    """Write the page as one file; return its path."""
     return write_file(path_of(path), fill_template("rotflex_jax.arena", "arena.html.j2", content(scores)))
 
 
 def content(scores: Scores) -> dict[str, Any]:
-    """What the template fills in; plain text that the template escapes."""
+    """Values for the template; plain text that the template escapes."""
     first = scores.methods[0].rows
     simulated = [r for r in first if r.kind != MEASURED]
     return {

@@ -1,4 +1,4 @@
-"""Records of an arena, drawn from a seed that no method sees, and the truth of each beside it."""
+"""Records of an arena, drawn from a seed that no method sees, with the truth of each record."""
 
 import pickle
 from collections.abc import Callable, Iterator
@@ -26,32 +26,32 @@ ONE, TWO, NOTHING, OUT, WORLD, MEASURED = (
 )
 """Kinds of records."""
 
-# A set of records has them in these shares, in an order of its own.
+# Kinds of a set of records in their shares; their order is drawn for each set.
 _CYCLE = (ONE, NOTHING, OUT, ONE, TWO, WORLD, ONE, ONE, NOTHING, OUT, ONE, ONE)
 FS, SHARE, TEST_SECONDS, WINDOW_SECONDS = 500.0, 0.7, 6.0, 2.0
-"""Sampling rate [Hz]; share of a record for training; of the test data that follow [s]; its runs [s]."""
+"""Sampling rate [Hz], share of a record for training, length of the test data and of a run in them [s]."""
 
-# Strengths and widths are drawn log-uniformly about those of the simulator's table.
+# Factors within which strengths and widths are drawn log-uniformly, relative to the table of the simulator.
 _SIZE, _WIDTH = (0.6, 1.6), (0.7, 1.4)
 _WIDTHS = {"presliding", "width", "speed", "frequency", "time"}
-# Numbers of worlds that no published table has.
+# First number of the worlds that are drawn here; no published table has them.
 _FIRST_WORLD = 100_000
 
 
 @dataclass(frozen=True)
 class Problem:
-    """What a method is given, and what it is not.
+    """A record: the data that a method receives, and the truth, which it does not receive.
 
     Attributes:
-        kind: What the record is; one of those of this module.
+        kind: Kind of the record; one of the kinds in this module.
         train: Recordings to fit.
-        validation: Recordings to decide on.
+        validation: Recordings for decisions.
         model: The textbook model.
         test: Recordings on which the free run of a model is scored.
         hidden: Effects that should be named.
-        forgiven: Names that are neither right nor wrong: those of what else is wrong in a wrong world.
-        noise: Standard deviation of each channel of the test recordings.
-        truth: All of the truth, fit for JSON.
+        forgiven: Names that are neither right nor wrong: those of further errors in a wrong world.
+        noise: Standard deviation of the sensor noise of each channel in the test recordings.
+        truth: The whole truth, in JSON types.
     """
 
     kind: str
@@ -67,12 +67,12 @@ class Problem:
     def given(self) -> bytes:
         """Training and validation recordings and the model, and nothing else, as bytes.
 
-        Copies: what is cut from a longer recording would have the rest of it behind the array.
+        Bytes are copies: an array that is cut from a longer recording would give access to the rest of it.
         """
         return pickle.dumps((list(self.train), list(self.validation), self.model))
 
     def runs(self) -> list[rf.Recording]:
-        """What a model is run over: the test recordings, of simulated ones in parts of a few seconds."""
+        """Recordings over which a model is run: test recordings; simulated ones are split into parts."""
         if self.kind == MEASURED:
             return [_alone(r, r.source) for r in self.test]
         found = []
@@ -82,18 +82,18 @@ class Problem:
         return found
 
     def asked(self) -> bytes:
-        """The same without outputs but for the first samples, as bytes."""
+        """The recordings of `runs` with only the first samples of their outputs, as bytes."""
         return pickle.dumps([_hidden(r) for r in self.runs()])
 
 
 def _hidden(r: rf.Recording) -> rf.Recording:
-    """A recording whose outputs stay where they are after the samples that a model may use."""
+    """A recording whose outputs are constant after the samples that a model may use."""
     y = r.y[np.minimum(np.arange(r.N), r.n_init - 1)]
     return replace(r, y=y, accept=ACCEPTABLE)
 
 
 def _alone(r: rf.Recording, source: str = "arena") -> rf.Recording:
-    """A recording without its source and without what came before it."""
+    """A recording without its source and without the part before it."""
     return replace(r, source=source, start=0.0, continues=None, accept=ACCEPTABLE)
 
 
@@ -105,15 +105,15 @@ def _noise(tests: tuple[rf.Recording, ...], model: Model) -> dict[str, float]:
 def drawn(
     records: int, seed: int, seconds: float = 20.0, say: Callable[[str], None] = lambda _: None
 ) -> list[Problem]:
-    """Simulated records: half with one hidden effect, the others of every other kind.
+    """Simulated records: half have one hidden effect, the others are of the other kinds.
 
     Effects, strengths, widths, inputs, constants of the machine and noise are drawn from the seed. The order
-    of the kinds is drawn too, so that the place of a record reveals nothing.
+    of the kinds is drawn too, so that the position of a record reveals nothing.
 
     Args:
-        records: How many.
-        seed: Of everything.
-        seconds: Length of what a method is given of a record, both parts together [s].
+        records: Number of records.
+        seed: Seed of all draws.
+        seconds: Length of the data that a method receives, training and validation together [s].
         say: Called with a line of progress.
     """
     rng = np.random.default_rng([seed, 20])
@@ -135,7 +135,7 @@ def drawn(
 
 
 def _in_turn(places: list[Place], rng: np.random.Generator) -> Iterator[Place]:
-    """All places in a drawn order, and then again in another one."""
+    """All places in a drawn order, then again in another order, without end."""
     while True:
         for k in rng.permutation(len(places)):
             yield places[int(k)]
@@ -146,7 +146,7 @@ def _log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
 
 
 def _record(kind: str, places: list[Place], seconds: float, rng: np.random.Generator) -> Problem:
-    """A record under an input that can show what it hides."""
+    """A record with an input that can show the hidden effects."""
     hidden = {}
     for place in places:
         values = parameters(place, _log_uniform(rng, *_SIZE))
@@ -172,7 +172,7 @@ def _record(kind: str, places: list[Place], seconds: float, rng: np.random.Gener
 
 
 def _world(rng: np.random.Generator) -> Problem:
-    """A wrong world."""
+    """A record from a wrong world."""
     from rotflex_jax.arena.wrong_worlds import world
 
     w = world(int(rng.integers(_FIRST_WORLD, 2**31)))
@@ -193,12 +193,12 @@ def _world(rng: np.random.Generator) -> Problem:
 
 
 def measured(say: Callable[[str], None] = lambda _: None) -> list[Problem]:
-    """Every direction of every measured machine whose recordings are on this machine.
+    """Every direction of every measured machine whose recordings are available here.
 
-    The truth of these is unknown; what counts is the free run over test recordings.
+    Their truth is unknown; the free run over test recordings is scored.
 
     Args:
-        say: Called with a line for each machine, also where it is left out.
+        say: Called with a line for each direction, and for each machine that is left out.
     """
     from rotflex_jax.arena.measured import MACHINES
 

@@ -1,4 +1,4 @@
-"""Scores of methods that look for missing effects: effects named, false alarms, answers withheld."""
+"""Scores of methods that search for missing effects: effects named, false alarms, answers withheld."""
 
 import contextlib
 import math
@@ -30,28 +30,28 @@ from rotflex_jax.checks import number, progress as checked_progress, shown, whol
 from rotflex_jax.errors import InputError
 
 BINS, LEAST = 10, 0.01
-"""Bins of equal width of a calibration; what is less probable than this is not counted."""
+"""Number of bins of equal width of a calibration; least probability that is counted."""
 
 FOUND, FAILED = "found", "failed"
 
-# A run whose error is so many times the noise has diverged.
+# A run has diverged if its error exceeds the noise by this factor.
 _DIVERGED = 1e6
 
 
 class Event(NamedTuple):
-    """A probability, and whether the statement that it was given for is true."""
+    """A probability, and whether the statement with this probability is true."""
 
     probability: float
     true: bool
 
 
 class Bin(NamedTuple):
-    """Events of about one probability.
+    """Events with similar probabilities.
 
     Attributes:
-        claimed: Their mean probability.
-        held: Share of them that are true.
-        cases: How many.
+        claimed: Mean probability of the events.
+        held: Share of the events that are true.
+        cases: Number of events.
     """
 
     claimed: float
@@ -60,7 +60,7 @@ class Bin(NamedTuple):
 
 
 def reliability(events: Iterable[Event]) -> list[Bin]:
-    """Events in `BINS` bins of equal width; empty ones left out."""
+    """Events in `BINS` bins of equal width, without empty bins."""
     listed = [e for e in events if e.probability >= LEAST]
     place = [min(int(BINS * e.probability), BINS - 1) for e in listed]
     groups = [[e for e, k in zip(listed, place, strict=True) if k == i] for i in range(BINS)]
@@ -93,31 +93,31 @@ class Share(NamedTuple):
 
 
 def name_of(place: Place) -> str:
-    """`coulomb@hub` of ("coulomb", "hub")."""
+    """`coulomb@hub` for ("coulomb", "hub")."""
     return "@".join(place)
 
 
 @dataclass(frozen=True)
 class Marks:
-    """One answer beside the truth.
+    """Marks of one answer, compared with the truth.
 
     Attributes:
         record: Number of the record, from 1.
-        kind: Of the record.
+        kind: Kind of the record.
         hidden: Effects that should be named.
         answered: Effects that were named.
         verdict: `found`, `nothing missing`, `unexplained` or `failed`.
-        reason: Why it failed, or why its model did not run.
-        hits: How many of the hidden effects were named, each by itself or by one that no recording
-            distinguishes from it.
-        wrong: Names that are neither true nor of what else is wrong.
-        right: Whether the answer as a whole is right.
-        events: Probabilities that were given, and whether the effects were there.
-        seconds: Time that the answer took.
+        reason: Why the method failed, or why its model did not run.
+        hits: Number of hidden effects that were named, by their own name or by that of an effect that no
+            recording distinguishes from them.
+        wrong: Names that are neither true nor belong to further errors of a wrong world.
+        right: Whether the whole answer is right.
+        events: Probabilities in the answer, and whether the effects were present.
+        seconds: Time that the answer took [s].
         error: Root mean square error of free runs over test recordings, divided by the noise of the sensors
-            (geometric mean over channels); of measured machines in the unit of the channel; None without a
+            (geometric mean over channels); for measured machines in the unit of the channel; None without a
             model.
-        truth: All of the truth, fit for JSON.
+        truth: The whole truth, in JSON types.
     """
 
     record: int
@@ -136,7 +136,7 @@ class Marks:
 
     @classmethod
     def of(cls, row: dict[str, Any]) -> "Marks":
-        """Marks of what `to_dict` has made."""
+        """The marks from the result of `to_dict`."""
         place = lambda name: tuple(name.split("@"))  # noqa: E731
         own = {n: tuple(map(place, row[n])) for n in ("hidden", "answered", "wrong")}
         events = tuple(Event(p, true) for p, true in row["probabilities"])
@@ -165,19 +165,19 @@ class Marks:
 def marked(
     problem: Problem, answer: Answer, record: int, error: float | None = None, note: str = ""
 ) -> Marks:
-    """An answer beside the truth.
+    """The marks of an answer.
 
-    On a record with one or two hidden effects the answer is right if it names them, each by itself or by an
-    effect that no recording distinguishes from it, and nothing else. On one with nothing hidden the right
-    answer is that nothing is missing. On one whose effect is outside the catalogue it is that something stays
-    unexplained. In a wrong world it is right to name the effect; names of what else is wrong there count
-    neither way.
+    For a record with one or two hidden effects, the answer is right if it names them and nothing else; an
+    effect that no recording distinguishes from a hidden one counts as its name. For a record with nothing
+    hidden, the right answer is that nothing is missing. For an effect outside the catalogue, the right answer
+    is that something stays unexplained. In a wrong world it is right to name the hidden effect; names of
+    further errors of that world count neither way.
 
     Args:
         problem: The record.
-        answer: What was said.
+        answer: The answer.
         record: Number of the record.
-        error: Of its model, as in `Marks`.
+        error: Error of the model in the answer, as in `Marks`.
         note: Why its model did not run.
     """
     said, hidden = set(answer.effects), problem.hidden
@@ -215,7 +215,7 @@ def marked(
 
 
 def failed(problem: Problem, reason: str, record: int, seconds: float) -> Marks:
-    """A record without an answer."""
+    """The marks of a record without an answer."""
     return Marks(
         record,
         problem.kind,
@@ -235,10 +235,10 @@ def failed(problem: Problem, reason: str, record: int, seconds: float) -> Marks:
 
 @dataclass(frozen=True)
 class MethodScore:
-    """What a method reached on a set of records.
+    """Score of a method on a set of records.
 
     Attributes:
-        method: Its name.
+        method: Name of the method.
         rows: Marks of every record.
     """
 
@@ -255,7 +255,7 @@ class MethodScore:
 
     @property
     def right(self) -> Share:
-        """Simulated records whose answer as a whole is right."""
+        """Simulated records whose whole answer is right."""
         return self._share(self.of(ONE, TWO, NOTHING, OUT, WORLD), lambda r: r.right)
 
     @property
@@ -266,17 +266,17 @@ class MethodScore:
 
     @property
     def wrong(self) -> int:
-        """Names that were wrong, over all simulated records but the wrong worlds."""
+        """Number of wrong names, over all simulated records except the wrong worlds."""
         return sum(len(r.wrong) for r in self.of(ONE, TWO, NOTHING, OUT))
 
     @property
     def alarms(self) -> Share:
-        """Records with nothing hidden on which something was said to be missing."""
+        """Records with nothing hidden for which the answer was that something is missing."""
         return self._share(self.of(NOTHING), lambda r: r.verdict in (FOUND, UNEXPLAINED))
 
     @property
     def withheld(self) -> Share:
-        """Records whose effect has no name on which the answer was `unexplained`."""
+        """Records with an effect outside the catalogue for which the answer was `unexplained`."""
         return self._share(self.of(OUT), lambda r: r.verdict == UNEXPLAINED)
 
     @property
@@ -287,23 +287,23 @@ class MethodScore:
 
     @property
     def worlds_wrong(self) -> int:
-        """Names in wrong worlds that were wrong."""
+        """Number of wrong names in wrong worlds."""
         return sum(len(r.wrong) for r in self.of(WORLD))
 
     @property
     def events(self) -> list[Event]:
-        """All probabilities that were given."""
+        """All probabilities in the answers."""
         return [e for r in self.rows for e in r.events]
 
     @property
     def calibration(self) -> float | None:
-        """Expected calibration error of the probabilities; None where none of `LEAST` or more was given."""
+        """Expected calibration error of the probabilities; None if all are below `LEAST`."""
         error = calibration_error(self.events)
         return None if math.isnan(error) else error
 
     @property
     def brier(self) -> float | None:
-        """Mean square of probability less truth (0 or 1); None where no probability was given."""
+        """Mean square of probability less truth (0 or 1); None without probabilities."""
         return statistics.fmean((e.probability - e.true) ** 2 for e in self.events) if self.events else None
 
     @property
@@ -314,17 +314,17 @@ class MethodScore:
 
     @property
     def error(self) -> float | None:
-        """Median error of free runs over simulated test recordings, in units of the sensors' noise."""
+        """Median error of free runs over simulated test recordings, in units of the sensor noise."""
         errors = [r.error for r in self.of(ONE, TWO, NOTHING, OUT, WORLD) if r.error is not None]
         return statistics.median(errors) if errors else None
 
     @property
     def failures(self) -> int:
-        """Records without an answer."""
+        """Number of records without an answer."""
         return sum(r.verdict == FAILED for r in self.rows)
 
     def summary(self) -> dict[str, Any]:
-        """All of it as plain JSON."""
+        """All scores as plain JSON."""
         shares = {n: list(getattr(self, n)) for n in ("right", "named", "alarms", "withheld", "worlds")}
         names = ("wrong", "worlds_wrong", "calibration", "brier", "seconds", "error", "failures")
         return {**shares, **{n: getattr(self, n) for n in names}, "events": len(self.events)}
@@ -342,7 +342,7 @@ COLUMNS = {
     "seconds": "s",
     "failures": "failed",
 }
-"""Columns of the table: what of a score, and its heading."""
+"""Columns of the table: attribute of `MethodScore` -> heading."""
 
 
 def cells(score: MethodScore) -> list[str]:
@@ -359,10 +359,10 @@ class Scores:
     """Scores of several methods on the same records.
 
     Attributes:
-        seed: What the records were drawn from.
+        seed: Seed from which the records were drawn.
         seconds: Length of a record [s].
-        limit: Most time for an answer [s].
-        methods: One score each.
+        limit: Time limit for an answer [s].
+        methods: Score of each method.
     """
 
     seed: int
@@ -374,7 +374,7 @@ class Scores:
         return self.to_markdown()
 
     def to_markdown(self) -> str:
-        """The table."""
+        """The table in Markdown."""
         head = ["method", *COLUMNS.values()]
         lines = [head, ["---", *["---:"] * len(COLUMNS)], *map(cells, self.methods)]
         return "\n".join("| " + " | ".join(line) + " |" for line in lines)
@@ -394,7 +394,7 @@ class Scores:
         }
 
     def report(self, path: str | Path) -> Path:
-        """Write one page that needs no other file; returns its path."""
+        """Write a self-contained page; return its path."""
         from rotflex_jax.arena.page import write
 
         return write(self, path)
@@ -410,30 +410,30 @@ def score(
     with_measured: bool = False,
     progress: Callable[[str], None] | None = None,
 ) -> Scores:
-    """Score methods that look for missing effects on records whose truth they cannot see.
+    """Score methods that search for missing effects on records whose truth they cannot see.
 
-    A method is a function `method(train, validation, model)` of lists of recordings and the textbook model;
-    it returns `"nothing missing"`, `"unexplained"`, a list of effects such as `["coulomb@hub"]`, or a mapping
+    A method is a function `method(train, validation, model)` of lists of recordings and the textbook model.
+    It returns `"nothing missing"`, `"unexplained"`, a list of effects such as `["coulomb@hub"]`, or a mapping
     with `effects`, `unexplained`, `probabilities` (effect -> number) and `model`, which simulates recordings.
-    One that raises, answers nonsense or takes too long has failed on that record.
+    If a method raises an error, gives an invalid answer or takes too long, it has failed on that record.
 
     Args:
-        methods: A function, which runs in this process; `"FILE.py:NAME"` or the name of an entrant, which has
-            a process of its own; or several of these.
-        records: How many simulated records; half have one hidden effect, see `problems.drawn`.
-        seed: What the records are drawn from; drawn itself where it is None. No method is given it.
+        methods: A function, which runs in this process; `"FILE.py:NAME"` or the name of an entrant, which
+            runs in a separate process; or several of these.
+        records: Number of simulated records; half have one hidden effect, see `problems.drawn`.
+        seed: Seed from which the records are drawn; a random seed if None. No method receives it.
         seconds: Length of a record, training and validation together [s].
-        limit: Most time for an answer [s]. A process is stopped then; a function of this process fails
-            when it returns.
-        with_measured: Score free runs on public recordings of measured machines as well, where these are
-            here.
+        limit: Time limit for an answer [s]. A process is stopped at this time; a function in this process
+            fails when it returns later.
+        with_measured: Whether to score also free runs on public recordings of measured machines, if these are
+            available.
         progress: Called with a line of text now and then.
 
     Returns:
-        The table, with all answers beside the truth; `report` writes it as a page.
+        The scores, with all answers and the truth; `report` writes them as a page.
 
     Raises:
-        InputError: An argument that makes no sense, or a method that cannot be loaded.
+        InputError: An argument is not valid, or a method cannot be loaded.
     """
     listed = [methods] if isinstance(methods, str) or callable(methods) else methods
     if not isinstance(listed, Sequence) or not listed:
@@ -477,13 +477,13 @@ def score(
 
 
 def answered(method: Here | Apart, problem: Problem, record: int, limit: float) -> Marks:
-    """The marks of a method on one record; whatever goes wrong is part of them.
+    """The marks of a method on one record, including failures.
 
     Args:
-        method: In this process or in one of its own.
+        method: Method in this process or in a separate one.
         problem: The record.
-        record: Its number.
-        limit: Most time for an answer [s].
+        record: Number of the record.
+        limit: Time limit for an answer [s].
     """
     began = time.perf_counter()
     try:
@@ -506,7 +506,7 @@ def run_error(problem: Problem, runs: Sequence[Float[np.ndarray, "_ C"]]) -> flo
     .. math::
         e = \prod_c (\mathrm{rms}_c / s_c)^{1/C}
 
-    with the noise :math:`s_c` of a channel; of a measured machine with :math:`s_c = 1`.
+    with the noise :math:`s_c` of a channel; for a measured machine :math:`s_c = 1`.
 
     Args:
         problem: The record.

@@ -1,9 +1,9 @@
-"""Wrong worlds: what a laboratory records of a machine whose model is wrong in more than one way.
+"""Wrong worlds: recordings as in a laboratory, of a machine whose model has more than one error.
 
-A world has one hidden effect that a search should name, with strength and shape drawn at random, and beside
-it what laboratories have: torques that no candidate describes, and faults that a candidate does describe.
-Trusted constants of the model are wrong, every run has a voltage offset of its own, a controller is in the
-loop, and its voltage and the counted angles are recorded.
+A world has one hidden effect that a search should name, with random strength and shape. In addition it has
+what laboratories have: torques that no candidate describes, and faults that a candidate does describe.
+Trusted constants of the model are wrong, every run has its own voltage offset, and the machine is in closed
+loop; the voltage of the controller and the angles in encoder counts are recorded.
 
     world = wrong_worlds.world(3000)
     rf.discover(world.model, world.train, world.validation)      # world.test is for the errors only
@@ -30,7 +30,10 @@ from rotflex_jax.arena.simulator.seen import distinctness
 Ranges = Mapping[str, tuple[float, float]]
 
 VISIBLE = 8.0
-"""What only the hidden effect explains over the sensor's noise, in training and in validation data."""
+"""Least ratio to the sensor noise of the part of a run that only the hidden effect explains.
+
+It must be reached in training and in validation data.
+"""
 
 _HUB = {"level": (0.012, 0.06)}
 _FINE = {"level": (0.003, 0.015)}
@@ -69,25 +72,25 @@ HIDDEN: dict[Place, Ranges] = {
     ("sensor_cubic", "theta"): {"cubic": (0.01, 0.15)},
     ("rectifier", "alpha"): {"loss": (0.05, 0.4)},
 }
-"""What a world may hide, every number drawn log-uniformly; units as in `simulator.hidden.DEFAULTS`.
+"""Effects that a world may hide; parameters are drawn log-uniformly, in units of `simulator.hidden.DEFAULTS`.
 
-Left out are what a textbook joint has free anyhow, the voltage offset that every run has, and friction whose
-asymmetry sits at arm or joint.
+Some effects are left out: those that the textbook joint has as free parameters, the voltage offset that every
+run has, and friction that is asymmetric at arm or joint.
 """
 
 _LINK = (("coulomb", "hub"), ("stribeck", "hub"), ("lugre", "hub"))
-# Kinds of worlds in turn; one of them hides nothing that has a name.
+# Kinds of worlds in turn; one of them hides no effect.
 _CYCLE = ("joint", "link", "joint", "joint") * 2 + ("joint", "link", "joint", "nothing")
 
 
 @dataclass(frozen=True)
 class Beside:
-    """Something else that is wrong.
+    """A further error of a world.
 
     Args:
-        name: of what it is.
-        values: its parameters.
-        names: places that would be a right name for it, or that take it up.
+        name: name of the error.
+        values: parameters of the error.
+        names: effects and ports that would be a right name for it, or that absorb it.
     """
 
     name: str
@@ -100,17 +103,18 @@ class World:
     """Three recordings of one machine, the model to start from, and the truth.
 
     Attributes:
-        seed: its number.
+        seed: number of the world.
         kind: `joint` or `link`.
         train: recording to fit.
-        validation: another reference, controller and offset.
-        test: a third reference, controller and offset; used for no fit and no choice.
+        validation: recording with another reference, controller and offset.
+        test: recording with a third reference, controller and offset; used for no fit and no choice.
         model: the textbook joint, with trusted constants as a user would have them.
         hidden: effect and port to be named, or None.
-        parameters: of the hidden effect, under the arena's names.
-        besides: what else is wrong.
-        visible: run -> what only the hidden effect explains over the sensor's deviation, of theta and alpha.
-        truth: plant, controllers and offsets, fit for JSON.
+        parameters: parameters of the hidden effect, under the names of the arena.
+        besides: further errors.
+        visible: run -> the part of theta and of alpha that only the hidden effect explains, divided by the
+            standard deviation of the sensor.
+        truth: plant, controllers and offsets, in JSON types.
     """
 
     seed: int
@@ -127,7 +131,7 @@ class World:
 
 
 def log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
-    """A number whose logarithm is uniform."""
+    """A random number whose logarithm is uniformly distributed."""
     return float(np.exp(rng.uniform(np.log(low), np.log(high))))
 
 
@@ -136,13 +140,13 @@ def _sign(rng: np.random.Generator) -> float:
 
 
 def true_plant(rng: np.random.Generator, kind: str) -> tuple[Plant, Beside]:
-    """Constants of the machine: those that a fit has free, and those that the model trusts, wrong."""
+    """Constants of the machine, and the errors of the constants that the model trusts."""
     plant = perturbed(rng, 0.2)
     factors: dict[str, float] = {n: float(rng.uniform(0.8, 1.2)) for n in ("R_m", "k_m", "eta")}
     plant = replace(plant, **{n: getattr(plant, n) * f for n, f in factors.items()})
     if kind == "link":  # a strip of steel damps less than bearings and springs
         plant = replace(plant, B_joint=log_uniform(rng, 2e-4, 2e-3))
-    # Wrong gain and back-EMF are taken up by torque constant and damper.
+    # Torque constant and damper absorb a wrong gain and back-EMF.
     return plant, Beside("trusted_constants", factors, (("viscous", "hub"),))
 
 
@@ -169,7 +173,7 @@ def _gauge(rng: np.random.Generator) -> Beside:
 
 
 def _modes(rng: np.random.Generator, link: bool) -> Beside:
-    """A second mode, of a link also a third; the gauge sees them as strain of its own."""
+    """A second mode, and for a link possibly a third; the gauge shows a share of their deflections."""
     own = lambda low, high: {  # noqa: E731
         "inertia": log_uniform(rng, 1e-4, 6e-4),
         "frequency": log_uniform(rng, low, high),
@@ -179,7 +183,7 @@ def _modes(rng: np.random.Generator, link: bool) -> Beside:
     if link and rng.random() < 0.5:
         modes["arm"] = own(28.0, 60.0)
     share = [_sign(rng) * log_uniform(rng, 0.1, 0.8) for _ in ("hub", "arm")]
-    # An oscillator that is absent rests at zero: its "deflection" would be the angle of its port.
+    # An oscillator that is absent stays at zero: its "deflection" would be the angle of its port.
     shown = [s if link and port in modes else 0.0 for s, port in zip(share, ("hub", "arm"), strict=True)]
     names = (("second_mode", "hub"), ("second_mode", "arm"))
     return Beside("more_modes", {"modes": modes, "shown": shown}, names)
@@ -195,7 +199,7 @@ def _late(_: np.random.Generator) -> Beside:
 
 
 def _drawn_besides(rng: np.random.Generator, kind: str, hidden: Place | None) -> list[Beside]:
-    """One or two things more; of a link its modes and its gauge as well."""
+    """One or two further errors; for a link its modes and its gauge, and possibly play and one more."""
     others = {"torque": _unnamed_torque, "crosstalk": _crosstalk, "late": _late}
     if kind == "link":
         made = [_modes(rng, True), _gauge(rng)]
@@ -207,14 +211,14 @@ def _drawn_besides(rng: np.random.Generator, kind: str, hidden: Place | None) ->
     if hidden is None or hidden[0] != "second_mode":
         others["modes"] = lambda r: _modes(r, False)
     count = rng.integers(1, 3)
-    # The torque without a name is the commonest of them.
+    # The torque that no candidate describes is drawn most often.
     chance = np.array([2.0 if n == "torque" else 1.0 for n in others])
     chosen = rng.choice(list(others), size=count, replace=False, p=chance / chance.sum())
     return [others[n](rng) for n in chosen]
 
 
 def _effects(besides: Sequence[Beside]) -> dict[Place, dict[str, float]]:
-    """What of the besides acts in the plant, as `simulator.laws` takes it."""
+    """The further errors that act in the plant, in the form of `simulator.laws`."""
     found: dict[Place, dict[str, float]] = {}
     for b in besides:
         if b.name in ("push", "shaking"):
@@ -229,7 +233,7 @@ def _effects(besides: Sequence[Beside]) -> dict[Place, dict[str, float]]:
 
 
 def _sensors(rng: np.random.Generator, kind: str, besides: Sequence[Beside]) -> Sensors:
-    """Two encoders, or an encoder and a gauge behind a 12-bit converter."""
+    """Two encoders, or an encoder and a gauge with a 12-bit converter."""
     values = {b.name: b.values for b in besides}
     made = Sensors(
         modes=tuple(values.get("more_modes", {}).get("shown", (0.0, 0.0))),
@@ -243,7 +247,7 @@ def _sensors(rng: np.random.Generator, kind: str, besides: Sequence[Beside]) -> 
 
 
 def _wandering(size: float, time: float, N: int, Ts: float, rng: np.random.Generator) -> np.ndarray:
-    """A torque of mean zero whose correlation decays within `time`."""
+    """A random torque with zero mean whose correlation decays with the time constant `time`."""
     keep, w, x = np.exp(-Ts / time), rng.standard_normal(N), np.empty(N)
     x[0] = w[0]
     for k in range(1, N):
@@ -252,7 +256,7 @@ def _wandering(size: float, time: float, N: int, Ts: float, rng: np.random.Gener
 
 
 def _plausible(loop: Loop) -> bool:
-    """A run that a laboratory would keep: it moves, does not ring, and rarely meets the voltage limit."""
+    """Whether a laboratory would keep a run: it moves, does not oscillate, rarely reaches full voltage."""
     theta, alpha = np.abs(loop.clean).max(axis=0)
     limited = np.mean(np.abs(loop.u) >= LIMIT)
     late = loop.u[loop.u.size // 2 :]
@@ -273,7 +277,7 @@ class _Machine:
 def _run(
     machine: _Machine, kind: str, N: int, Ts: float, rng: np.random.Generator
 ) -> tuple[Loop, Controller, str, float] | None:
-    """One run that a laboratory would keep, or None if the controller is not fit for this machine."""
+    """One run that a laboratory would keep, or None if the controller does not suit this machine."""
     controller = designed(kind, Plant(), rng)
     offset, shape = float(rng.uniform(-0.06, 0.06)), str(rng.choice(list(REFERENCES)))
     before = round(rng.uniform(0.5, 2.0) / Ts)
@@ -298,7 +302,7 @@ def _recording(loop: Loop, Ts: float, sensors: Sensors, seed: int, name: str) ->
 
 
 def _hides(seed: int) -> tuple[str, Place | None]:
-    """Kind of world and hidden effect, so that a row of seeds has all of them."""
+    """Kind of world and hidden effect, such that consecutive seeds go through all of them."""
     turn, place = divmod(seed, len(_CYCLE))
     if _CYCLE[place] == "nothing":
         return ("joint", "link")[turn % 2], None
@@ -306,21 +310,20 @@ def _hides(seed: int) -> tuple[str, Place | None]:
     if _CYCLE[place] == "link":
         return "link", _LINK[before % len(_LINK)]
     places = list(HIDDEN)
-    # A stride without a common divisor visits all, neighbours in the table far apart.
+    # A stride coprime to the length visits all entries; neighbours in the table are far apart.
     return "joint", places[7 * before % len(places)]
 
 
 def world(seed: int) -> World:
-    """The wrong world of a number, always the same.
+    """The wrong world with this number; always the same for the same number.
 
-    Strength and shape of the hidden effect are drawn again until `simulator.seen` finds it in training and
-    validation data.
+    The world is drawn again until `simulator.seen` finds the hidden effect in training and validation data.
 
     Args:
-        seed: its number.
+        seed: number of the world.
 
     Raises:
-        RuntimeError: if no draw of many shows the effect.
+        RuntimeError: if none of many draws shows the effect.
     """
     kind, place = _hides(seed)
     for attempt in range(40):
@@ -337,7 +340,7 @@ def _attempt(seed: int, kind: str, place: Place | None, rng: np.random.Generator
     sensors = _sensors(rng, kind, besides)
     parameters = {} if place is None else {n: log_uniform(rng, *r) for n, r in HIDDEN[place].items()}
     others = _effects(besides)
-    # The hidden effect last, so that its state is the last (`simulator.seen`).
+    # The hidden effect comes last, so that its state is the last one (`simulator.seen`).
     effects = others if place is None else {**others, place: parameters}
     wander = next(((b.values["size"], b.values["time"]) for b in besides if b.name == "random_torque"), None)
     machine = _Machine(plant, effects, sensors, wander)

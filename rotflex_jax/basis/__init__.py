@@ -1,7 +1,7 @@
-"""Bases: a signal goes in, one named regressor per column comes out.
+"""Bases: the regressors of a signal, one named regressor per column.
 
-Delays suit a slow sampling, orthonormal filters a fast one or a long memory; Volterra series take the
-products of either. `reach` tells beforehand what a bank can do, `optimise_poles` finds its poles.
+Delays are suitable for slow sampling, orthonormal filters for fast sampling or a long memory. Volterra series
+use products of either. `minimum_nmse` gives the least error of a bank, `optimise_poles` finds its poles.
 """
 
 from rotflex_jax.basis.bank import Bank, Basis, Delays

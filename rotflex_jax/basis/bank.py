@@ -1,7 +1,7 @@
-"""What a basis is, and the simplest banks: delays, and means over intervals.
+"""Interfaces of banks and bases, and the simplest banks: delays, and means over intervals.
 
-A bank is linear: delays, or orthonormal filters. A basis makes the regressors of a model: the monomials of
-a bank's outputs, as they are or orthogonalised.
+A bank is linear: delays, or orthonormal filters. A basis gives the regressors of a model: monomials of the
+outputs of a bank, or orthogonal combinations of them.
 """
 
 import abc
@@ -39,12 +39,12 @@ class Bank(eqx.Module):
     @property
     @abc.abstractmethod
     def names(self) -> tuple[str, ...]:
-        """Of the columns."""
+        """Names of the columns."""
 
     @property
     @abc.abstractmethod
     def reach(self) -> int:
-        """Samples after which the impulse response has decayed, to a millionth of its size."""
+        """Number of samples after which the impulse response has decayed to a millionth of its size."""
 
     @abc.abstractmethod
     def respond(self, u: Float[Array, " N"]) -> Float[Array, "N M"]:
@@ -74,7 +74,7 @@ class Basis(Traced, Protocol):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the regressors."""
+        """Names of the regressors."""
         ...
 
     @property
@@ -87,7 +87,7 @@ class Basis(Traced, Protocol):
         ...
 
     def units(self, input_unit: str = "V", output_unit: str = "rad") -> tuple[str, ...]:
-        """Of the weights."""
+        """Units of the weights."""
         ...
 
     def kernels(self, w: Any, length: int | None = None) -> Mapping[int, Any]:
@@ -99,20 +99,20 @@ _respond = jax.jit(lambda part, u: part.respond(u))
 
 
 def evaluate(part: Traced, u: Any) -> Float[np.ndarray, "N P"]:
-    """Columns as an array, in the precision of the signal; compiled once for each shape."""
+    """Columns for a signal as an array in the precision of the signal; compiled once for each shape."""
     u = signal(u)
     with working_precision(u):
         return np.asarray(_respond(part, jnp.asarray(u)))
 
 
 def require_basis(basis: Any) -> None:
-    """Refuses what is no basis.
+    """Refuses an argument that is no basis.
 
     Raises:
-        InputError: A bank was given, or anything else.
+        InputError: A bank was given, or anything else that is no basis.
     """
     wanted = ("names", "degrees", "regressors", "units", "kernels")
-    # The class comes first: making all names takes longer than a filter over a short record.
+    # The class is checked first, since to make all names takes longer than a filter over a short record.
     if not all(hasattr(type(basis), name) or hasattr(basis, name) for name in wanted):
         raise InputError(
             f"A basis such as Volterra(Delays(5)) is needed, but {type(basis).__name__} was given; wrap a "
@@ -134,15 +134,15 @@ class Delays(Bank):
 
         z_i[t] = u[t - first - i],  i = 0 ... memory - 1,  u = 0 before the first sample
 
-    Not for sampling much faster than the plant: its impulse response must decay within the memory. A bank
-    of orthonormal filters needs fewer weights there.
+    Not for sampling much faster than the plant: the impulse response of the plant must decay within the
+    memory. A bank of orthonormal filters then needs fewer weights.
 
     Args:
         memory: Number of taps.
-        first: Delay of the first tap [samples]; 1 where the output has no direct feedthrough.
+        first: Delay of the first tap [samples]; 1 if the output has no direct feedthrough.
 
     Raises:
-        InputError: A memory below 1, or a negative delay.
+        InputError: The memory is below 1, or the delay is negative.
 
     >>> bank = Delays(3, first=1)
     >>> bank.names
@@ -189,17 +189,17 @@ class Averages(Bank):
 
         z_i[t] = mean of u[t - first - i width - j] over j = 0 ... width - 1,  i = 0 ... count - 1
 
-    With width 1 these are the plain delays. The width is an argument of the compiled code, so another one
-    compiles nothing again. Not for a plant that responds within less than a step: only the mean of its
-    response over each is known.
+    With width 1 these are plain delays. The width is an argument of the compiled code, so another width needs
+    no compilation. Not for a plant whose response changes within a step: only the mean of the response over
+    each step is represented.
 
     Args:
         count: Number of steps.
-        width: Samples in each.
-        first: Delay of the first [samples]; 1 where the output has no direct feedthrough.
+        width: Number of samples in each step.
+        first: Delay of the first step [samples]; 1 if the output has no direct feedthrough.
 
     Raises:
-        InputError: A count or a width below 1, or a negative delay.
+        InputError: The count or the width is below 1, or the delay is negative.
 
     >>> Averages(2, 2, first=0).outputs([2.0, 4.0, 6.0, 8.0])
     array([[1., 0.],

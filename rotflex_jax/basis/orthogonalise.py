@@ -1,8 +1,9 @@
 """Orthonormal combinations of the regressors of a Volterra series: for a Gaussian input, or for a sample.
 
-The aim is that all weights of a gradient filter converge equally fast. Least squares gives the same model
-with or without, since the regressors span the same space. Nor is it always faster on real data: where a
-few linear directions have nearly all power, the raw regressors with a step size per degree may be faster.
+The aim is that all weights of a gradient filter converge equally fast. Least squares gives the same model for
+raw and for orthonormal regressors, since they span the same space. On real data convergence is not always
+faster: if a few linear directions have nearly all the power, the raw regressors with a step size per degree
+may converge faster.
 """
 
 import itertools
@@ -21,7 +22,7 @@ from rotflex_jax.basis.volterra import Index, Volterra, from_tensor, indices, sp
 from rotflex_jax.checks import signal
 from rotflex_jax.errors import InputError
 
-# Relative norm of the residual below which a column depends linearly on those before it.
+# Relative norm of the residual below which a column counts as linearly dependent on the columns before it.
 DEPENDENT_RESIDUAL = 1e-10
 
 
@@ -35,8 +36,8 @@ class Orthogonalised(eqx.Module):
     Args:
         volterra: The raw regressors.
         transform: T (P, P'), upper triangular in blocks of the degrees.
-        names: Of the columns.
-        degrees: Of the columns.
+        names: Names of the columns.
+        degrees: Degrees of the columns.
     """
 
     volterra: Volterra
@@ -77,18 +78,18 @@ class Orthogonalised(eqx.Module):
         return np.asarray(self.transform) @ w
 
     def kernels(self, w: Any, length: int | None = None) -> dict[int, Any]:
-        """Symmetric kernels in the domain of delays, as `Volterra.kernels` gives them."""
+        """Symmetric kernels in the domain of delays, as from `Volterra.kernels`."""
         return self.volterra.kernels(self.raw_weights(w), length)
 
     def units(self, input_unit: str = "V", output_unit: str = "rad") -> tuple[str, ...]:
-        """Of the weights: that of the output."""
+        """Unit of each weight, which is the unit of the output."""
         return (output_unit,) * self.size
 
     def step_sizes(self, by_degree: Mapping[int, Any]) -> Any:
         """A step size per weight (P,), from one per degree.
 
         Args:
-            by_degree: Degree -> step size, a number or a traced one.
+            by_degree: Degree -> step size, which may be traced.
         """
         return spread(by_degree, self.degrees)
 
@@ -98,11 +99,11 @@ class Hermite(Orthogonalised):
 
         v = L^-1 z,  R1 = E[z z'] = L L';  psi = product of He_k(v_i) / sqrt(k!),  E[psi psi'] = I
 
-    The square of a Gaussian has a mean, so `(v^2 - 1) / sqrt(2)` needs the constant, and a cube the
-    linear terms: without these the polynomials leave the span of the series. For another input they
-    are no more than nearly orthogonal; `GramSchmidt` takes the sample as it is.
+    The square of a Gaussian variable has a mean, so `(v^2 - 1) / sqrt(2)` needs the constant, and a cube
+    needs the linear terms: without these the polynomials leave the span of the series. For an input that is
+    not Gaussian they are at best approximately orthogonal; `GramSchmidt` is exact for a given sample.
 
-    Source: Wiener 1958; Schetzen 1980, chapter 13; the whitening by Cholesky is free to choose.
+    Source: Wiener 1958; Schetzen 1980, chapter 13. Any whitening would do; this one is by Cholesky.
 
     >>> from rotflex_jax.basis import Delays
     >>> basis = Hermite.of(Volterra(Delays(2)), [[1.0, 0.8], [0.8, 1.0]])
@@ -116,10 +117,10 @@ class Hermite(Orthogonalised):
 
         Args:
             volterra: The raw regressors, with every lower degree of the same parity.
-            covariance: R1 (M, M) of the outputs of its bank, whose mean is zero.
+            covariance: Covariance R1 (M, M) of the outputs of the bank, whose mean is zero.
 
         Raises:
-            InputError: Degrees that do not close the span, or a matrix that is no covariance.
+            InputError: A lower degree is missing, or the matrix is no covariance.
         """
         m, chosen = volterra.bank.size, set(volterra.chosen)
         for d in sorted(chosen):
@@ -136,12 +137,12 @@ class Hermite(Orthogonalised):
 
 
 class GramSchmidt(Orthogonalised):
-    """Each regressor less its projection on those before it, on a sample of any input.
+    """Each regressor less its projection on the regressors before it, for a sample of any input.
 
         phi = Q R,  T = sqrt(N) R^-1
 
-    Columns that depend on earlier ones are left out. Orthonormal on that sample only: another input,
-    even of the same distribution but short, is not.
+    Columns that depend linearly on earlier ones are left out. The regressors are orthonormal on that sample
+    only, and not on another one, such as a short sample of the same distribution.
 
     Source: Golub and Van Loan 2013, section 5.2 (QR); Korenberg 1988 for its use with Volterra series.
 

@@ -1,8 +1,8 @@
 """Orthonormal filters with given poles: Laguerre, Kautz and the general case.
 
-Each section is an all-pass filter in a balanced realisation: its matrix `[A B; C D]` is orthogonal.
-So is that of any chain of them, hence `A A' + B B' = I`: the impulse responses of the states are
-orthonormal sequences. Complex poles come in pairs and need no complex arithmetic.
+Each section is an all-pass filter in a balanced realisation: its matrix `[A B; C D]` is orthogonal. The
+matrix of a chain of sections is orthogonal too, hence `A A' + B B' = I`: the impulse responses of the states
+are orthonormal sequences. Complex poles come in pairs and need no complex arithmetic.
 """
 
 from collections.abc import Sequence
@@ -29,7 +29,7 @@ def sections(poles: Sequence[complex]) -> tuple[SectionKinds, Float[np.ndarray, 
     A real pole `a` has one parameter, a pair two: its real and its positive imaginary part.
 
     Raises:
-        InputError: No poles, one on or outside the unit circle, or one without its conjugate.
+        InputError: There are no poles, a pole is not inside the unit circle, or its conjugate is missing.
     """
     given = np.atleast_1d(np.asarray(poles, complex))
     if given.ndim != 1 or not given.size or not np.isfinite(given).all():
@@ -63,7 +63,7 @@ def sections(poles: Sequence[complex]) -> tuple[SectionKinds, Float[np.ndarray, 
 
 
 def poles_of(kinds: SectionKinds, numbers: Float[np.ndarray, " M"]) -> tuple[complex, ...]:
-    """The poles, pairs next to each other."""
+    """The poles, with the two poles of a pair next to each other."""
     poles, k = [], 0
     for kind in kinds:
         if kind == "real":
@@ -77,7 +77,7 @@ def poles_of(kinds: SectionKinds, numbers: Float[np.ndarray, " M"]) -> tuple[com
 
 
 def chain(kinds: SectionKinds, numbers: Float[Array, " M"]) -> tuple[Float[Array, "M M"], Float[Array, " M"]]:
-    """`A`, `B` of the chain, `x+ = A x + B u`; traced in the parameters."""
+    """`A`, `B` of the chain, `x+ = A x + B u`; the parameters may be traced."""
     n = len(numbers)
     zero = jnp.zeros(n, numbers.dtype)
     through_x, through_u = zero, jnp.ones((), numbers.dtype)  # input of the next section
@@ -109,7 +109,7 @@ def _pair(re: Float[Array, ""], im: Float[Array, ""]) -> Section:
     """`(-c + b (c - 1) z^-1 + z^-2) / (1 + b (c - 1) z^-1 - c z^-2)`, `c = -|p|^2`."""
     c = -(re**2 + im**2)
     b = 2 * re / (1 - c)
-    # 1 - b^2 without the cancellation that a pole near one would suffer.
+    # 1 - b^2 in a form without cancellation for a pole near one.
     q = jnp.sqrt((1 - c - 2 * re) * (1 - c + 2 * re)) / (1 - c)
     k = jnp.sqrt((1 - c) * (1 + c))
     A = jnp.stack([jnp.stack([-b * c, c * q]), jnp.stack([q, b])])
@@ -170,18 +170,18 @@ class Orthonormal(Bank):
         a pair  z^-first sqrt(1 - c^2) (1 - b z^-1) / D  and  z^-first sqrt((1 - c^2)(1 - b^2)) z^-1 / D,
         D = 1 + b (c - 1) z^-1 - c z^-2,  c = -|p|^2,  b = 2 Re(p) / (1 + |p|^2)
 
-    A linear plant with just these poles is exactly a weighted sum of them, at any sampling period.
-    Poles are arguments of the compiled code, so another value compiles nothing again.
+    The output of a linear plant with exactly these poles is a weighted sum of the outputs of the bank, at any
+    sampling period. Poles are arguments of the compiled code, so other values need no compilation.
 
-    Not for poles on the unit circle, such as that of an angle that integrates: take the delays, or
+    Not for poles on the unit circle, such as the pole of an angle that integrates a speed: use delays, or
     fit the speed.
 
     Args:
-        poles: In the z domain, each complex one with its conjugate; may repeat.
+        poles: Poles in the z domain, each complex pole with its conjugate; poles may be repeated.
         first: Delay of the whole bank [samples]; 1 for a plant without direct feedthrough.
 
     Raises:
-        InputError: A pole that does not decay, or a complex one without its conjugate.
+        InputError: A pole is not inside the unit circle, or a complex pole lacks its conjugate.
 
     Source: Ninness and Gustafsson 1997, IEEE Trans. Autom. Control 42, equations 3 and 9.
 
@@ -208,7 +208,7 @@ class Orthonormal(Bank):
         """Functions that share one real pole, for a plant that is well damped.
 
         Args:
-            pole: Between -1 and 1.
+            pole: The pole, between -1 and 1.
             count: Number of functions.
             first: Delay of the whole bank [samples].
 
@@ -229,7 +229,7 @@ class Orthonormal(Bank):
         """Functions that share one pair of complex poles, for one resonance.
 
         Args:
-            pole: One of the pair.
+            pole: One pole of the pair.
             count: Number of functions, even.
             first: Delay of the whole bank [samples].
         """
@@ -250,8 +250,8 @@ class Orthonormal(Bank):
         """Functions with the poles `exp(s Ts)` of a sampled plant.
 
         Args:
-            continuous_poles: s [1/s], such as the eigenvalues of a state matrix, without an
-                integrator.
+            continuous_poles: Poles s in continuous time [1/s], such as the eigenvalues of a state matrix,
+                without an integrator.
             Ts: Sampling period [s].
             first: Delay of the whole bank [samples].
 
@@ -271,17 +271,17 @@ class Orthonormal(Bank):
         """The bank with other parameters of its sections, which may be traced.
 
         Args:
-            numbers: Of each section: a real pole, or real and imaginary part of a pair.
+            numbers: Parameters of each section: a real pole, or real and imaginary part of a pair.
         """
         return eqx.tree_at(lambda bank: bank.numbers, self, numbers)
 
     @property
     def poles(self) -> tuple[complex, ...]:
-        """In the z domain, each pair next to each other."""
+        """Poles in the z domain, with the two poles of a pair next to each other."""
         return poles_of(self.kinds, np.asarray(self.numbers))
 
     def continuous_poles(self, Ts: float) -> tuple[complex, ...]:
-        """log(pole) / Ts [1/s]."""
+        """Poles in continuous time, log(pole) / Ts [1/s]."""
         return tuple(complex(s) for s in np.log(np.array(self.poles)) / sampling_period(Ts))
 
     @property
@@ -298,7 +298,7 @@ class Orthonormal(Bank):
     def reach(self) -> int:
         """Samples after which the impulse response has decayed, to about a millionth of its size."""
         slowest = max(abs(p) for p in self.poles)
-        # Repeated poles have a polynomial in front of the decay, which lasts longer.
+        # The response of repeated poles is a polynomial times the decay, which lasts longer.
         return self.first + int(np.ceil((14 + 3 * self.size) / -np.log(max(slowest, 0.05))))
 
     def respond(self, u: Float[Array, " N"]) -> Float[Array, "N M"]:

@@ -1,6 +1,6 @@
-"""Poles of orthonormal filters: from data by variable projection, and the least error a bank can reach.
+"""Poles of orthonormal filters, from data by variable projection, and the least error that a bank can reach.
 
-Exact for a linear plant and an input whose autocovariance is known, without any recording.
+The least error is exact for a linear plant and a known autocovariance of the input, without a recording.
 """
 
 import dataclasses
@@ -26,7 +26,7 @@ def ar1(a: float, length: int) -> Float[np.ndarray, " L"]:
 
     Args:
         a: exp(-2 pi bandwidth Ts); 0 for white noise.
-        length: Lags from 0 to give.
+        length: Number of lags, from 0.
 
     >>> ar1(0.5, 3)
     array([1.  , 0.5 , 0.25])
@@ -45,7 +45,7 @@ def bank_covariance(bank: Bank, autocovariance: Any = (1.0,)) -> Float[np.ndarra
 
     Args:
         bank: The filters.
-        autocovariance: Of the input, lags from 0; zero beyond those given. White unless given.
+        autocovariance: Autocovariance of the input at lags from 0, zero beyond the last; white by default.
 
     >>> from rotflex_jax.basis import Delays
     >>> bank_covariance(Delays(2), ar1(0.5, 2))
@@ -63,11 +63,11 @@ def minimum_nmse(bank: Bank, impulse_response: Any, autocovariance: Any = (1.0,)
 
     Args:
         bank: The filters.
-        impulse_response: h of the plant (L,), until it has decayed.
-        autocovariance: Of the input, lags from 0; zero beyond those given. White unless given.
+        impulse_response: Impulse response h of the plant (L,), until it has decayed.
+        autocovariance: Autocovariance of the input at lags from 0, zero beyond the last; white by default.
 
     Raises:
-        InputError: Too few lags, or an impulse response of zero.
+        InputError: There are too few lags, or the impulse response is zero.
 
     Source: Wiener 1949; Haykin 2014, Adaptive Filter Theory, section 2.4.
 
@@ -90,12 +90,12 @@ def fir_nmse(impulse_response: Any, autocovariance: Any = (1.0,), first: int = 0
     """`minimum_nmse` of `Delays(1, first)`, `Delays(2, first)`, ..., all from one factorisation.
 
     Args:
-        impulse_response: h of the plant (L,), until it has decayed.
-        autocovariance: Of the input, lags from 0; zero beyond those given. White unless given.
+        impulse_response: Impulse response h of the plant (L,), until it has decayed.
+        autocovariance: Autocovariance of the input at lags from 0, zero beyond the last; white by default.
         first: Delay of the first tap [samples].
 
     Returns:
-        Entry M - 1 belongs to a memory of M; precise to about 1e-13.
+        NMSE, in which entry M - 1 belongs to a memory of M; accurate to about 1e-13.
     """
     h = signal(impulse_response, "impulse_response").astype(float)
     first = whole(first, "first", 0)
@@ -103,18 +103,18 @@ def fir_nmse(impulse_response: Any, autocovariance: Any = (1.0,), first: int = 0
     power = _power(h, r)
     p = scipy.linalg.matmul_toeplitz(r, h)[first:]
     root = scipy.linalg.cholesky(scipy.linalg.toeplitz(r[: len(p)]), lower=True)
-    # The first M entries of the solution are the solution of the first M taps.
+    # The first M entries of the triangular solution are the solution for the first M taps.
     gains = scipy.linalg.solve_triangular(root, p, lower=True) ** 2
     return np.maximum(1 - np.cumsum(gains) / power, 0.0)
 
 
 def memory_for(nmse: float, impulse_response: Any, autocovariance: Any = (1.0,), first: int = 0) -> int:
-    """Fewest delays that reach an error.
+    """Smallest number of delays with which an error can be reached.
 
     Args:
         nmse: Squared error over the variance of the output, for instance 0.01.
-        impulse_response: h of the plant (L,), until it has decayed.
-        autocovariance: Of the input, lags from 0; zero beyond those given. White unless given.
+        impulse_response: Impulse response h of the plant (L,), until it has decayed.
+        autocovariance: Autocovariance of the input at lags from 0, zero beyond the last; white by default.
         first: Delay of the first tap [samples].
 
     >>> memory_for(0.07, 0.5 ** np.arange(40))
@@ -130,16 +130,16 @@ def memory_for(nmse: float, impulse_response: Any, autocovariance: Any = (1.0,),
 def best_laguerre(
     impulse_response: Any, count: int, first: int = 1, grid: int = 60
 ) -> tuple[Orthonormal, float]:
-    """The Laguerre bank of given size that is closest to an impulse response, and its error.
+    """The Laguerre bank of a given size that is closest to an impulse response, and its error.
 
-    The error as a function of the pole has several minima, about one per function, so a grid over
-    all decays comes first, from the whole response down to one sample.
+    The error as a function of the pole has several minima, about one per function. So the search starts with
+    a grid over all decays, from the whole response down to one sample.
 
     Args:
-        impulse_response: h of the plant (L,), until it has decayed.
+        impulse_response: Impulse response h of the plant (L,), until it has decayed.
         count: Number of functions.
         first: Delay of the bank [samples].
-        grid: Poles to try before the best one is improved.
+        grid: Number of poles on the grid, of which the best one is refined.
 
     Returns:
         The bank, and |h - B c|^2 / |h|^2.
@@ -190,13 +190,13 @@ def _power(h: Float[np.ndarray, " L"], r: Float[np.ndarray, " L"]) -> float:
     return power
 
 
-# Beyond this modulus a pole decays over a million samples: the search ended at the unit circle.
+# Modulus of a pole that decays over a million samples; beyond it a search has ended at the unit circle.
 LARGEST_MODULUS = 1 - 1e-6
 
 
 @dataclasses.dataclass(frozen=True)
 class PoleStart:
-    """One start of a search: where it ended, with which error, and how."""
+    """Result of one start of a search: final poles, error, reason of the end, and evaluations."""
 
     poles: tuple[complex, ...]
     nmse: float
@@ -206,14 +206,14 @@ class PoleStart:
 
 @dataclasses.dataclass(frozen=True)
 class PoleSearch:
-    """What a search for poles found.
+    """Result of a search for poles.
 
     Attributes:
-        status: Of the best start: "converged", or in words what stopped it.
-        nmse: Squared error over the squared deviation from the mean (over the squared output where
-            there is no constant).
-        starts: Every start, the best first; equal errors with different poles mean that the data do
-            not distinguish them.
+        status: Status of the best start: "converged", or the reason why it stopped, in words.
+        nmse: Squared error over the squared deviation from the mean (over the squared output without a
+            constant).
+        starts: Results of all starts, the best first. Equal errors with different poles mean that the data do
+            not distinguish these poles.
     """
 
     status: str
@@ -222,13 +222,13 @@ class PoleSearch:
 
     @property
     def poles(self) -> tuple[complex, ...]:
-        """Of the best start, without repetitions."""
+        """Poles of the best start, without repetitions."""
         return self.starts[0].poles
 
     def __str__(self) -> str:
         lines = [f"Poles: {self.status}, NMSE {self.nmse:.4g}"]
         for start in self.starts:
-            # One of each pair says it all.
+            # One pole of each pair is printed.
             listed = ", ".join(
                 f"{p.real:.4f}" + (f" ± {p.imag:.4f}j" if p.imag else "") for p in start.poles if p.imag >= 0
             )
@@ -261,7 +261,7 @@ _slopes = jax.jit(lambda residual, z, args: jax.jacfwd(residual)(z, args), stati
 
 
 def _descend(residual: _Residual, z: Float[np.ndarray, " M"], args: Any, most: int) -> PoleStart:
-    """One start of the search."""
+    """Runs the search from one start."""
     with double_precision():
         args = (args[0], *map(jnp.asarray, args[1:]))
         try:
@@ -277,7 +277,7 @@ def _descend(residual: _Residual, z: Float[np.ndarray, " M"], args: Any, most: i
             )
             z, nmse, steps = end.x, 2 * float(end.cost), int(end.nfev)
             status = "converged" if end.status > 0 else f"stopped after {most} evaluations"
-        except ValueError:  # what scipy says where a number is not finite
+        except ValueError:  # scipy raises it if a number is not finite
             nmse, steps, status = float("nan"), 0, "failed: the error is not finite"
         numbers = numbers_of(residual.kinds, residual.signs, jnp.asarray(z))
     poles = poles_of(residual.kinds, np.asarray(numbers))
@@ -301,36 +301,37 @@ def optimise_poles(
     max_steps: int = 100,
     seed: int = 0,
 ) -> tuple[Orthonormal, PoleSearch]:
-    """Find the poles with which a series comes closest to a recording.
+    """Finds the poles for which a Volterra series fits a recording best.
 
         minimise over the poles  |y - phi(poles) w|^2,  w = least squares for these poles
 
-    Variable projection: only the poles are searched, by Levenberg-Marquardt with exact derivatives,
-    in the logarithms of decay and angle, so that no pole can leave the unit circle. Several starts
-    show whether the result depends on the start. For a linear plant it is the plant's own poles.
+    By variable projection only the poles are searched, with the Levenberg-Marquardt method and exact
+    derivatives. The coordinates are the logarithms of decay and angle, so that no pole can leave the unit
+    circle. Several starts show whether the result depends on the start. For a linear plant the result is the
+    poles of the plant.
 
     Not for many free poles: beyond about six the error is flat, and the poles are interchangeable.
 
     Args:
-        u: Input (N,), or several recordings as a list.
-        y: Output (N,), or a list.
-        poles0: First poles, in the z domain, each complex pole with its conjugate; their number, and
-            which are real, does not change.
-        degrees: Of the Volterra series whose weights are fitted inside.
-        constant: Whether it has a constant.
-        repeat: How often the poles repeat: one real pole four times is a Laguerre bank of four.
+        u: Input (N,), or a list of the inputs of several recordings.
+        y: Output (N,), or a list of outputs.
+        poles0: First poles in the z domain, each complex pole with its conjugate. The number of real and of
+            complex poles does not change.
+        degrees: Degrees of the Volterra series whose weights are fitted.
+        constant: Whether the series has a constant.
+        repeat: Number of repetitions of the poles: one real pole four times is a Laguerre bank of four.
         first: Delay of the bank [samples].
-        skip: Samples at the start of each recording that do not count.
-        starts: The first is `poles0`, the others are drawn around it.
-        spread: Standard deviation of the others, in the logarithms.
-        max_steps: Most evaluations of each start.
-        seed: Of the starts.
+        skip: Number of samples at the start of each recording that do not count.
+        starts: Number of starts: the first is `poles0`, the others are drawn around it.
+        spread: Standard deviation of the other starts, in the logarithms.
+        max_steps: Most evaluations for each start.
+        seed: Seed of the starts.
 
     Returns:
         The bank with the best poles, and the result of every start.
 
     Raises:
-        InputError: Shapes that do not fit, poles that do not decay.
+        InputError: Shapes do not fit, or a pole is not inside the unit circle.
 
     Source: Golub and Pereyra 1973, SIAM J. Numer. Anal. 10; for Laguerre-Volterra series Kibangou,
     Favier and Hassani 2005, EURASIP J. Appl. Signal Process.
@@ -359,7 +360,7 @@ def optimise_poles(
     best = ends[0]
     search = PoleSearch(best.status, best.nmse, tuple(ends))
     if not np.isfinite(best.nmse) or any(abs(p) >= 1 for p in best.poles):
-        return repeated, search  # the poles that were given, rather than none
+        return repeated, search  # without a valid result, the poles that were given
     return Orthonormal(best.poles * repeat, first, repeated.label), search
 
 
@@ -370,11 +371,11 @@ def _label(bank: Orthonormal, repeat: int) -> str:
 
 
 Stacked = Float[np.ndarray, "R N"]
-"""Recordings of different length, filled up with zeros."""
+"""Recordings of different lengths, padded with zeros."""
 
 
 def _stack(u: Any, y: Any, skip: int, constant: bool) -> tuple[Stacked, Stacked, Stacked]:
-    """Inputs, scaled outputs, and one where a sample counts."""
+    """Inputs, scaled outputs, and a mask that is one for samples that count."""
     many = isinstance(u, (list, tuple)) and len(u) > 0 and np.ndim(u[0]) == 1
     us = [signal(x).astype(float) for x in (u if many else [u])]
     ys = [signal(x, "y").astype(float) for x in (y if many else [y])]

@@ -18,7 +18,7 @@ from rotflex_jax.checks import entries, shown, whole
 from rotflex_jax.errors import InputError
 
 Index = tuple[int, ...]
-"""Columns of a product; () is the constant."""
+"""Columns of the bank that form a product; () is the constant."""
 
 
 @cache
@@ -36,7 +36,7 @@ def indices(size: int, degree: int, layout: str) -> tuple[Index, ...]:
 
 
 def orders(index: Index) -> int:
-    """In how many orders its factors can be written.
+    """Number of orders in which the factors of a product can be written.
 
     >>> orders((0, 0, 1))
     3
@@ -45,7 +45,7 @@ def orders(index: Index) -> int:
 
 
 def title(index: Index, names: Sequence[str]) -> str:
-    """Such as `u[t]^2 * u[t-1]`.
+    """Name of a product, such as `u[t]^2 * u[t-1]`.
 
     >>> title((0, 0, 1), ["u[t]", "u[t-1]"])
     'u[t]^2 * u[t-1]'
@@ -99,13 +99,13 @@ def from_tensor(tensor: Float[np.ndarray, "*M"], size: int, layout: str) -> Floa
 def change_axes(tensor: Float[np.ndarray, "*M"], matrix: Float[np.ndarray, "L m"]) -> Float[np.ndarray, "*L"]:
     """The matrix applied to every axis of a tensor (m, ...)."""
     for _ in range(tensor.ndim):
-        # The first axis becomes the last, so after all of them the order is as before.
+        # The first axis becomes the last, so the original order returns after all axes.
         tensor = np.tensordot(tensor, matrix, axes=(0, 1))
     return tensor
 
 
 LARGEST_KERNEL = 20_000_000
-"""Most entries of one kernel, for want of memory."""
+"""Largest number of entries of one kernel, a limit for the memory."""
 
 
 def kernels_of(
@@ -114,10 +114,10 @@ def kernels_of(
     """Degree -> symmetric kernel (length, ...), from the weights of each degree.
 
     Args:
-        bank: Of the series.
+        bank: Bank of the series.
         parts: Degree -> weights.
-        layout: Of the weights.
-        length: Delays from 0 to give [samples]; as far as the bank reaches if None.
+        layout: Layout of the weights.
+        length: Number of delays, from 0 [samples]; `bank.reach` if None.
     """
     length = whole(bank.reach if length is None else length, "length", 1)
     most = max(parts)
@@ -139,9 +139,9 @@ def weights_of(
     """Degree -> weights, from kernels over the delays from 0 on.
 
     Args:
-        bank: Of the series.
+        bank: Bank of the series.
         kernels: Degree -> kernel (length, ...), of any symmetry.
-        layout: Of the weights.
+        layout: Layout of the weights.
         tolerance: Share of a kernel that may lie outside the span of the bank.
     """
     found = {}
@@ -177,20 +177,20 @@ class Volterra(eqx.Module):
 
         y_hat[t] = w_0 + sum w_i z_i[t] + sum w_ij z_i[t] z_j[t] + ...,  z = outputs of the bank
 
-    The full layout lists a product once for every order of its factors, as the sums over all delays
-    are often written; equal columns make it rank deficient, so least squares needs the minimum norm.
-    Not for dry friction that sticks, nor for a strong threshold, which no low degree approximates.
+    The full layout lists a product once for every order of its factors, as the sums over all delays are often
+    written. Equal columns make it rank deficient, so least squares needs the minimum norm solution. Not for
+    dry friction that sticks or for a strong threshold, which no low degree approximates.
 
     Args:
-        bank: `Delays`, `Orthonormal`, or another.
-        order: All degrees from 1 to this one.
-        degrees: The degrees instead, such as (1, 3) where the plant is odd.
-        constant: Whether there is a constant. Without it the even degrees also have to fit the
+        bank: `Delays`, `Orthonormal`, or another bank.
+        order: Highest degree; the series has all degrees from 1 to this one.
+        degrees: The degrees, instead of `order`, such as (1, 3) for an odd plant.
+        constant: Whether the series has a constant. Without it the even degrees also have to fit the
             mean of the output, and are biased.
-        layout: "triangular", each product once, or "full".
+        layout: "triangular" for each product once, or "full".
 
     Raises:
-        InputError: Degrees, layout or step sizes that make no sense.
+        InputError: Degrees or layout are not valid.
 
     Source: Schetzen 1980, The Volterra and Wiener theories of nonlinear systems.
 
@@ -298,7 +298,7 @@ class Volterra(eqx.Module):
         return evaluate(self, u)
 
     def units(self, input_unit: str = "V", output_unit: str = "rad") -> tuple[str, ...]:
-        """Of the weights.
+        """Units of the weights.
 
         >>> from rotflex_jax.basis import Delays
         >>> Volterra(Delays(1), order=3).units()
@@ -314,7 +314,7 @@ class Volterra(eqx.Module):
 
         Args:
             w: Weights (P,).
-            length: Delays from 0 to give [samples]; as far as the bank reaches unless given.
+            length: Number of delays, from 0 [samples]; `bank.reach` if None.
 
         Returns:
             Degree -> kernel (length, ...); of degree 0 a number.
@@ -332,13 +332,13 @@ class Volterra(eqx.Module):
         """Weights of given kernels; the inverse of `kernels`.
 
         Args:
-            kernels: Degree -> kernel over the delays from 0 on, of any symmetry; those left out are zero.
+            kernels: Degree -> kernel over the delays from 0 on, of any symmetry; missing kernels are zero.
             tolerance: Share of a kernel that may lie outside the span of the bank; `numpy.inf` gives the
                 best approximation in any case.
 
         Raises:
-            InputError: A degree that the basis lacks, a kernel that is no cube, or one that the bank does
-                not span.
+            InputError: The basis lacks a degree, the axes of a kernel have different lengths, or a kernel
+                lies outside the span of the bank.
         """
         strange = sorted(set(kernels) - set(self.chosen))
         if strange:
@@ -354,9 +354,9 @@ class Volterra(eqx.Module):
         """A step size per weight (P,), from one per degree.
 
         Args:
-            by_degree: Degree -> step size, a number or a traced one.
-            as_full: Multiply that of a product by the number of its orders, so that a triangular
-                filter moves exactly as one in the full layout does.
+            by_degree: Degree -> step size, which may be traced.
+            as_full: Whether to multiply the step size of a product by its number of orders, so that a filter
+                in the triangular layout behaves exactly like a filter in the full layout.
 
         >>> from rotflex_jax.basis import Delays
         >>> Volterra(Delays(2)).step_sizes({0: 0.1, 1: 0.01, 2: 0.001}, as_full=True)

@@ -1,4 +1,4 @@
-"""The summary of a batch as one page that needs no other file, with its figures."""
+"""The summary of a batch as one self-contained page, with its figures."""
 
 from typing import Any
 
@@ -16,9 +16,9 @@ from rotflex_jax.text.markup import fill_template
 from rotflex_jax.text.numbers import multiple, plain_number, ratio, readable, together
 from rotflex_jax.text.plotting import FigureRegistry, blank, by_section, legend_above, plain_ticks
 
-# Effects that are drawn, the most frequent ones.
+# Number of effects that are drawn, the most frequent ones.
 MOST_EFFECTS = 15
-# Dots that are drawn one by one; more are a picture.
+# Largest number of recordings whose dots are drawn one by one; more dots become a bitmap.
 MOST_DOTS = 2000
 
 FIGURES = FigureRegistry()
@@ -39,7 +39,7 @@ def _tally_caption(fleet: Fleet) -> str:
     description="Bars: in how many recordings each effect was found.",
 )
 def tally(fleet: Fleet) -> Figure | None:
-    """In how many recordings each effect was found; None where none was."""
+    """Figure of the number of recordings in which each effect was found; None if no effect was found."""
     if not fleet.effects:
         return None
     shown = list(fleet.effects.items())[:MOST_EFFECTS][::-1]
@@ -68,7 +68,7 @@ def tally(fleet: Fleet) -> Figure | None:
     description="Held-out error after the search against that before, on logarithmic scales.",
 )
 def errors(fleet: Fleet) -> Figure | None:
-    """Held-out errors in multiples of the noise: after the search over before; None without an answer."""
+    """Held-out errors after the search against those before, in multiples of the noise; None without any."""
     if not any(r.verdict for r in fleet.rows):
         return None
     channels = list(fleet.units)
@@ -106,7 +106,7 @@ def errors(fleet: Fleet) -> Figure | None:
     return figure
 
 
-# Rows that a page can show; the table for programs has all.
+# Largest number of rows on a page; the CSV file has all rows.
 LISTED_ROWS = 1000
 
 
@@ -116,7 +116,7 @@ def render(fleet: Fleet) -> str:
 
 
 def content(fleet: Fleet) -> dict[str, Any]:
-    """What the template fills in; plain text that the template escapes."""
+    """Values for the template; plain text that the template escapes."""
     good = [r for r in fleet.rows if r.verdict]
     return {
         "title": f"{len(fleet.rows)} recordings, one search each",
@@ -134,7 +134,7 @@ def content(fleet: Fleet) -> dict[str, Any]:
 
 
 def _summary(fleet: Fleet) -> str:
-    """What there is to know, in words."""
+    """The summary in words."""
     counts = fleet.verdicts
     phrases = {verdict.value: verdict.shown.phrase for verdict in Verdict} | {"failed": "without an answer"}
     said = [f"{n} {phrases[v]}" for v, n in counts.items() if v in phrases]

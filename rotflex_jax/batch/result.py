@@ -1,4 +1,4 @@
-"""Result of a fleet: one row per recording, and their summary."""
+"""Result of a fleet: one row for each recording, and a summary."""
 
 import csv
 import dataclasses
@@ -18,19 +18,19 @@ class RecordingRow:
     """One recording.
 
     Attributes:
-        name: Of the recording, and of its file of results.
-        source: Its file, or the source of the recording.
-        verdict: As in `Discovery`; empty where there is none, and then `reason` says why.
-        effects: Added effects: effect, port, and the others that this recording does not distinguish.
-        before: Channel -> validation error of the given model, of short free runs.
-        after: The same of the final model.
-        whole_before: Channel -> error of one free run over all validation data.
-        whole_after: The same of the final model.
+        name: Name of the recording, and of its file of results.
+        source: File of the recording, or its `source`.
+        verdict: As in `Discovery`; empty if there is none, and then `reason` states why.
+        effects: Added effects: effect, port, and the equivalent effects of this recording.
+        before: Channel -> validation error of the given model, in short free runs.
+        after: Channel -> validation error of the final model, in short free runs.
+        whole_before: Channel -> error of the given model in one free run over all validation data.
+        whole_after: Channel -> error of the final model in one free run over all validation data.
         noise: Channel -> standard deviation of the sensor noise.
         window_seconds: Length of the short runs [s].
         seconds: Time taken [s].
-        reason: One sentence where it failed.
-        known: Whether it is the result of an earlier call.
+        reason: One sentence if the search failed.
+        known: Whether the result is from an earlier call.
     """
 
     name: str
@@ -49,7 +49,7 @@ class RecordingRow:
 
     @classmethod
     def of(cls, record: Record, known: bool = False) -> "RecordingRow":
-        """The row of a file of results."""
+        """The row for the content of a file of results."""
         head = {k: record[k] for k in ("name", "source", "reason", "seconds")}
         found = record["result"]
         if found is None:
@@ -81,7 +81,7 @@ class RecordingRow:
         return ", ".join(" or ".join(f"{e}@{p}" for e, p in listed) for listed in sets)
 
     def flat(self, channels: tuple[str, ...]) -> dict[str, Any]:
-        """One value per column, SI units."""
+        """One value for each column, in SI units."""
         errors = {
             f"{c}_{what}": getattr(self, field).get(c)
             for c in channels
@@ -102,10 +102,10 @@ class Fleet:
     """Result of a fleet.
 
     Attributes:
-        rows: Of the finished recordings, in the order given.
+        rows: Rows of the finished recordings, in the order given.
         total: Number of recordings that were given.
         units: Output -> its unit.
-        folder: With `summary.html`, `summary.csv`, the folders `recordings` and `models`.
+        folder: Folder with `summary.html`, `summary.csv` and the folders `recordings` and `models`.
         elapsed_s: Time taken by this call [s].
     """
 
@@ -117,7 +117,7 @@ class Fleet:
 
     @property
     def page(self) -> Path:
-        """The summary for people."""
+        """Path of the summary as a page."""
         return self.folder / "summary.html"
 
     @property
@@ -127,7 +127,7 @@ class Fleet:
 
     @property
     def effects(self) -> dict[tuple[str, str], tuple[int, int]]:
-        """Effect and port -> recordings that show it alone, and as one of several; descending."""
+        """Effect and port -> number of recordings with it alone, and as one of equivalents; descending."""
         alone, among = Counter(), Counter()
         for row in self.rows:
             for effect, port, others in row.effects:
@@ -138,7 +138,7 @@ class Fleet:
 
     @property
     def verdicts(self) -> dict[str, int]:
-        """Verdict -> how many; `failed` for those without."""
+        """Verdict -> number of recordings; `failed` for recordings without a verdict."""
         return dict(Counter(r.verdict or "failed" for r in self.rows).most_common())
 
     def to_dict(self) -> dict[str, Any]:
@@ -156,7 +156,7 @@ class Fleet:
         }
 
     def to_csv(self) -> str:
-        """One row per recording; no text in it is a formula of a spreadsheet."""
+        """One row for each recording; no text can act as a formula of a spreadsheet."""
         text = io.StringIO()
         table = csv.DictWriter(text, list(RecordingRow("", "").flat(tuple(self.units))), lineterminator="\n")
         safe = lambda x: spreadsheet_cell(printable(x)) if isinstance(x, str) else x  # noqa: E731
@@ -166,7 +166,7 @@ class Fleet:
         return text.getvalue()
 
     def write(self) -> Path:
-        """Write `summary.csv` and `summary.html`; returns the path of the page."""
+        """Write `summary.csv` and `summary.html`; return the path of the page."""
         from rotflex_jax.batch.page import render  # matplotlib is loaded only where it draws
         from rotflex_jax.text.markup import write_files
 

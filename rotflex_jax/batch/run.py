@@ -40,37 +40,39 @@ def fleet(
 ) -> Fleet:
     """Search many recordings, each separately, and summarise them.
 
-    Every recording is split, searched, and written to a file of its own as soon as it is finished. The
-    same call continues where an earlier one stopped, and repeats only what has changed: the recording, the
-    model, the share, how it is read, the version of the package. A recording that cannot be used is a row
-    with a reason; a process or machine that fails costs only the time it had spent.
+    Each recording is split and searched, and its result is written to a separate file as soon as it is
+    finished. The same call continues where an earlier one stopped. It repeats a search only if something has
+    changed: the recording, the model, the share, the arguments of reading, or the version of the package. A
+    recording that cannot be used gives a row with a reason. If a process or machine fails, only its time is
+    lost.
 
     Not for recordings of one machine in one state: `discover` on all of them together is more accurate than
-    many searches of one. In a script, call it below `if __name__ == "__main__":`, as in every program that
+    separate searches. In a script, call it below `if __name__ == "__main__":`, as in every program that
     starts processes.
 
     Args:
-        joint: The model that each search starts from.
-        recordings: Files, or recordings; of any lengths.
-        folder: Where to write `summary.html`, `summary.csv`, `recordings/NAME.json`, and
-            `models/NAME.json`, which `Model.load` reads.
+        joint: The model from which each search starts.
+        recordings: Files or recordings, of any lengths.
+        folder: Folder for `summary.html`, `summary.csv`, `recordings/NAME.json`, and `models/NAME.json`,
+            which `Model.load` reads.
         scheduler: Address of a Dask scheduler, `tcp://HOST:8786`, whose workers can read the files under the
-            same paths and have one thread each; the processes of this machine if None.
-        workers: Processes of this machine; 0 for none but this one; by its cores and memory if None.
-        split: Share of each recording for training, the first part.
-        pages: Whether to write `pages/NAME.html` for each, the report of its search without torques that are
-            missing or learned; the summary links to it. For a recording searched before, none is written.
-        search: Function of `(model, train, test)`; `functools.partial(rf.discover, rounds=2)` for
-            instance.
+            same paths and have one thread each. If None, processes of this machine are used.
+        workers: Number of processes of this machine; 0 to use the calling process alone; if None, as many as
+            its cores and memory allow.
+        split: Share of each recording for training, at its beginning.
+        pages: Whether to write `pages/NAME.html` for each recording: the report of its search, without latent
+            and learned torques. The summary links to it. No page is written for a recording that was searched
+            in an earlier call.
+        search: Function of `(model, train, test)`, such as `functools.partial(rf.discover, rounds=2)`.
         progress: Called with a line of text for each recording.
         reading: Arguments of `rotflex_jax.load` for the files, such as `degrees=True`.
 
     Returns:
-        One row per recording, in the order given.
+        One row for each recording, in the order given.
 
     Raises:
-        InputError: No recording, one that is given twice, a share outside 0 to 1, an unknown argument, a
-            folder that cannot be written, a scheduler that does not answer.
+        InputError: There is no recording, a recording is given twice, the share is not between 0 and 1, an
+            argument is unknown, the folder cannot be written, or the scheduler does not answer.
     """
     model, progress = Model.of(joint), checks.progress(progress)
     sources = _sources(recordings)
@@ -92,7 +94,7 @@ def fleet(
         with closing(_carried_out(batch.unfinished(), scheduler, workers)) as results:
             for number, found in results:
                 batch.finish(number, found)
-    finally:  # also where the loop is interrupted
+    finally:  # also if the loop is interrupted
         result = Fleet(batch.rows, len(sources), units, batch.folder, batch.elapsed)
         result.write()
         if len(batch.rows) < len(sources):
@@ -123,7 +125,7 @@ def _pickled(model: Model, search: Search) -> bytes:
 
 
 def _sources(recordings: Any) -> list[Source]:
-    """Recordings and paths of files."""
+    """Recordings and paths of files, checked."""
     wrong = [recordings]
     if (found := checks.entries(recordings)) is not None:
         wrong = [r for r in found if not isinstance(r, Recording | str | os.PathLike)]

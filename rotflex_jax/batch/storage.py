@@ -1,4 +1,4 @@
-"""Results on disk: one file per recording, a digest of its inputs, and which recordings are finished."""
+"""Results on disk: a file for each recording, with a digest of its inputs; which recordings are finished."""
 
 import dataclasses
 import functools
@@ -30,7 +30,7 @@ RESULT_SCHEMA = 1
 def digest_of_search(
     model: Model, search: Search, share: float, reading: Mapping[str, Any], places: Iterable[str]
 ) -> str:
-    """Digest of everything that the recordings have in common; the same in every process."""
+    """Digest of everything that the searches have in common; the same in every process."""
     m = model.mechanism
     physics = (m.coordinates, m.ports, m.effects, m.outputs, sorted(m.trusted), m.units)
     text = repr(
@@ -53,7 +53,7 @@ def digest_of_recording(source: Path | Recording, common: str) -> str:
 
 
 def _named(search: Any) -> str:
-    """Name of a function, with its bound arguments; the same in every process."""
+    """Name of a function with its bound arguments; the same in every process."""
     if isinstance(search, functools.partial):
         words = sorted((name, _written(value)) for name, value in search.keywords.items())
         return f"{_named(search.func)}{_written(search.args)}{words!r}"
@@ -61,7 +61,7 @@ def _named(search: Any) -> str:
 
 
 def _written(value: Any) -> str:
-    """An argument as text; functions by their names, since their `repr` has an address in it."""
+    """An argument as text; functions by their names, because their `repr` contains an address."""
     if isinstance(value, list | tuple):
         return f"{type(value).__name__}({', '.join(map(_written, value))})"
     if isinstance(value, functools.partial) or inspect.isroutine(value):
@@ -70,7 +70,7 @@ def _written(value: Any) -> str:
 
 
 def names_of(sources: Sequence[Path | Recording]) -> list[str]:
-    """A name for each recording, fit for a file: that of its own file where no other has it.
+    """A name for each recording that is valid for a file: the name of its file if that is unique.
 
     >>> names_of([Path("a/run.csv"), Path("b/run.csv"), Path("b/step.csv")])[2]
     'step'
@@ -91,11 +91,11 @@ def _short(source: Path | Recording, number: int) -> str:
 
 
 def write(folder: Path, record: Record) -> None:
-    """Writes a result, and before it its model and its page; each completely or not at all."""
+    """Writes the model and the page of a result, then the result; each completely or not at all."""
     record = {"schema": RESULT_SCHEMA, **record}
     model, page, name = record.pop("model"), record.pop("page", None), f"{record['name']}.json"
     for path, text in ((folder / MODELS / name, model), (page_of(folder, record["name"]), page)):
-        if text is None:  # what an earlier search left is not of this one
+        if text is None:  # a file of an earlier search does not belong to this one
             path.unlink(missing_ok=True)
         else:
             write_file(path, text)
@@ -103,12 +103,12 @@ def write(folder: Path, record: Record) -> None:
 
 
 def page_of(folder: Path, name: str) -> Path:
-    """Where the page of a recording is, if it has one."""
+    """Path of the page of a recording, whether or not it exists."""
     return folder / PAGES / f"{name}.html"
 
 
 def read(folder: Path, name: str, digest: str) -> Record | None:
-    """The result of the same search of the same recording; None where there is no valid one."""
+    """The stored result of the same search of the same recording; None if there is no valid one."""
     try:
         known = json.loads((folder / RESULTS / f"{name}.json").read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):
@@ -118,7 +118,7 @@ def read(folder: Path, name: str, digest: str) -> Record | None:
 
 
 def _is_whole(known: Record) -> bool:
-    """Whether a file has all that a row of the summary shows, each of its kind."""
+    """Whether a file has all entries of a row of the summary, with the right types."""
     try:
         row = RecordingRow.of(known)
         errors = (row.before, row.after, row.whole_before, row.whole_after, row.noise)
@@ -134,10 +134,10 @@ def _is_whole(known: Record) -> bool:
 
 
 def created(folder: str | os.PathLike[str], pages: bool = False) -> Path:
-    """The folder of the results, created if needed, with a place for pages where there will be some.
+    """The folder of the results, created if needed, with a folder for pages if there will be some.
 
     Raises:
-        InputError: It cannot be.
+        InputError: The folder cannot be created.
     """
     if not isinstance(folder, str | os.PathLike):
         raise InputError(
@@ -158,14 +158,14 @@ Source = Path | Recording
 
 
 class BatchProgress:
-    """Finished and unfinished recordings of a batch, with a row and a file for each finished one.
+    """Finished and unfinished recordings of a batch, with a row and a file for each finished recording.
 
     Args:
         sources: Files or recordings.
-        task: Of each, but for its source.
-        common: Digest of what all have in common.
-        folder: Of the files.
-        progress: Called with a line of text for each that is finished.
+        task: Task of every recording, without its source.
+        common: Digest of everything that the searches have in common.
+        folder: Folder of the results.
+        progress: Called with a line of text for each finished recording.
     """
 
     def __init__(
@@ -185,7 +185,7 @@ class BatchProgress:
 
     @property
     def rows(self) -> tuple[RecordingRow, ...]:
-        """Of the finished recordings, in the order given."""
+        """Rows of the finished recordings, in the order given."""
         return tuple(self._rows[number] for number in sorted(self._rows))
 
     @property
@@ -194,7 +194,7 @@ class BatchProgress:
         return time.perf_counter() - self.start
 
     def unfinished(self) -> Iterator[tuple[int, SearchTask]]:
-        """Number and task of each that no earlier call has finished; files are read when they are needed."""
+        """Number and task of each recording that no earlier call finished; files are read when needed."""
         for number, source in enumerate(self.sources):
             try:
                 self._digests[number] = digest_of_recording(source, self.common)
@@ -210,7 +210,7 @@ class BatchProgress:
                 self._rows[number] = RecordingRow.of({**known, **self._labels(number)}, known=True)
 
     def finish(self, number: int, found: Record) -> None:
-        """Stores a result."""
+        """Stores a result and reports it."""
         found = {**self._labels(number), "digest": self._digests.get(number, ""), **found}
         write(self.folder, found)
         row = self._rows[number] = RecordingRow.of(found)

@@ -1,7 +1,7 @@
-"""One recording of a fleet: the task of a worker, its execution and result, and the digest of its code.
+"""One recording of a fleet: the task of a worker, its execution and result, and the text of its code.
 
-The file of a main program changes with every recording that is added to its list, and a notebook has none. So
-the compiled code counts, with the values and the functions of the main program that it uses.
+The file of a main program changes with every recording that is added to its list, and a notebook has no file.
+Therefore its compiled code enters the digest, with the values and functions of the main program that it uses.
 """
 
 import contextlib
@@ -30,21 +30,23 @@ from rotflex_jax.recording import Recording
 from rotflex_jax.runtime.xla import enable_fast_start
 
 MAIN = ("__main__", "__mp_main__")
-"""Names of the main program, here and in its worker processes."""
+"""Module names of the main program, in its own process and in its worker processes."""
 
 _PLAIN = (int, float, complex, str, bytes, bool, type(None), type(Ellipsis))
 
 
 def of_main(thing: Any) -> bool:
-    """Whether a function or a class is one of the main program."""
+    """Whether a function or a class is defined in the main program."""
     return getattr(thing, "__module__", None) in MAIN
 
 
 def code_text(subjects: Iterable[Any]) -> str:
-    """Text of functions and classes of the main program, and of all of it that they use; the same each time.
+    """Text of functions and classes of the main program and of everything there that they use.
+
+    The text is the same in every process.
 
     Args:
-        subjects: Functions and classes; those of other modules count with their names.
+        subjects: Functions and classes; those of other modules enter by their names.
     """
     seen: set[int] = set()
     return "\n".join(line for subject in subjects for line in _lines(subject, seen))
@@ -110,7 +112,7 @@ def _class(cls: type, seen: set[int]) -> Iterator[str]:
     for base in cls.__mro__[1:]:
         yield from _lines(base, seen)
     for name, value in sorted(vars(cls).items()):
-        # What abstract classes make of the rest, and where it was written.
+        # Attributes that abstract classes add, and the place of the definition.
         if name.startswith("_abc") or name in _MADE:
             continue
         yield name
@@ -124,31 +126,31 @@ _MADE = frozenset(
 
 
 def _names(code: types.CodeType) -> set[str]:
-    """Names that code uses, that of functions inside of it too."""
+    """Names that code uses, including the code of inner functions."""
     inner = (_names(value) for value in code.co_consts if isinstance(value, types.CodeType))
     return set(code.co_names).union(*inner)
 
 
 Search = Callable[[Model, Recording, Recording], Any]
 Record = dict[str, Any]
-"""Plain JSON: `state` is `done`, `refused` (bad input) or `broken` (worth another try); with it go `reason`,
-`seconds`, `result`, and the texts of the files `model` and `page`."""
+"""Plain JSON: `state` is `done`, `refused` (bad input) or `broken` (worth another try). Further entries are
+`reason`, `seconds`, `result`, and the texts of the files `model` and `page`."""
 
-# A search uses a whole core and much memory, so the threads of a worker search one after the other.
+# A search uses a whole core and much memory, so the threads of a worker search one after another.
 _ONE_SEARCH = threading.Lock()
 
 
 @dataclasses.dataclass(frozen=True)
 class SearchTask:
-    """One recording, and how it is searched.
+    """One recording and its search.
 
     Attributes:
         source: A file, which every worker must be able to read, or the recording itself.
         reading: Arguments of `rotflex_jax.load` for a file.
         share: Share of the recording for training.
-        what: Pickled `(model, search)`; they can only be unpickled after the `places` are imported.
+        what: Pickled `(model, search)`; it can only be unpickled after the `places` are imported.
         places: Python files or modules with effects of the user.
-        pages: Whether the result has a page too.
+        pages: Whether the result includes a page.
     """
 
     source: Path | Recording
@@ -160,26 +162,26 @@ class SearchTask:
 
 
 def carry_out(task: SearchTask) -> Record:
-    """Searches one recording; every error becomes a sentence in the result."""
+    """Searches one recording; an error becomes a sentence in the result."""
     with _ONE_SEARCH:
         start = time.perf_counter()
         try:
             found = record("done") | _searched(task)
         except InputError as error:
             found = record("refused", str(error))
-        except (Exception, SystemExit) as error:  # it must not stop the others
+        except (Exception, SystemExit) as error:  # it must not stop the other recordings
             found = record("broken", f"{type(error).__name__}: {error}")
         return found | {"seconds": time.perf_counter() - start}
 
 
 def record(state: str, reason: str = "") -> Record:
-    """The record of a recording without a result; the reason on one line."""
+    """The record of a recording without a result, with the reason on one line."""
     files: Record = {"model": None, "page": None}
     return {"state": state, "reason": " ".join(reason.split()), "seconds": 0.0, "result": None} | files
 
 
 def prepared(task: SearchTask) -> Record:
-    """`carry_out` in a process whose settings are still the defaults."""
+    """`carry_out` in a process that still has the default settings."""
     enable_fast_start()
     return carry_out(task)
 
@@ -195,7 +197,7 @@ def _searched(task: SearchTask) -> Any:
 
 
 def _model(found: Any) -> str | None:
-    """The file of the final model as text; None where a search has none, or none that can be read again."""
+    """The file of the final model as text; None if there is no model, or if it could not be read back."""
     if not hasattr(found, "save"):
         return None
     with tempfile.TemporaryDirectory() as folder, contextlib.suppress(InputError):
@@ -204,7 +206,7 @@ def _model(found: Any) -> str | None:
 
 
 def _page(found: Any) -> str | None:
-    """The report of a search as text, without what takes as long as another round; None where it has none."""
+    """The report of a search as text, without its slow parts; None if the search has no report."""
     if not isinstance(found, Discovery):
         return None
     from rotflex_jax.report.page import render  # matplotlib is loaded only where it draws
@@ -216,7 +218,7 @@ def _page(found: Any) -> str | None:
 
 
 def subjects(model: Model, search: Search) -> tuple[Any, ...]:
-    """The function that searches, without its bound arguments, and all effects that it may meet."""
+    """The search function without its bound arguments, and all effects that it may use."""
     function: Any = search
     while isinstance(function, functools.partial):
         function = function.func
@@ -224,15 +226,15 @@ def subjects(model: Model, search: Search) -> tuple[Any, ...]:
 
 
 def places_of(model: Model, search: Search, *, far: bool) -> tuple[str, ...]:
-    """Files and modules of the user that a worker needs, for effects that are searched or in the model.
+    """Files and modules of the user that a worker needs: for the search, its effects and those of the model.
 
     Args:
         model: The model.
-        search: Function of it.
-        far: Whether the workers are those of a cluster; those of this machine import the main program.
+        search: The search function.
+        far: Whether the workers are on a cluster; workers on this machine import the main program.
 
     Raises:
-        InputError: The main program is among them, and the workers are far.
+        InputError: The main program is among them, and the workers are on a cluster.
     """
     parts = (s for s in subjects(model, search) if s.__module__.split(".")[0] != "rotflex_jax")
     names = {s.__module__: s.__qualname__ for s in parts}
@@ -246,6 +248,6 @@ def places_of(model: Model, search: Search, *, far: bool) -> tuple[str, ...]:
 
 
 def _place(module: str) -> str:
-    """A module of a package by its name, a file that stands alone by its path."""
+    """The name of a module in a package, or the path of a single file."""
     file = getattr(sys.modules.get(module), "__file__", None)
     return module if "." in module or file is None else str(Path(file).resolve())

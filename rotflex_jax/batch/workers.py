@@ -1,8 +1,8 @@
 """A batch in processes of this machine or on the workers of a Dask scheduler.
 
-Plain `multiprocessing`: `ProcessPoolExecutor` breaks as a whole when one process dies, does not say which
-recording it had, and cannot stop a running task. A process and a pipe per worker do both, without
-another package.
+Plain `multiprocessing` is used: `ProcessPoolExecutor` breaks as a whole when one process dies, does not tell
+which recording the process had, and cannot stop a running task. A process and a pipe for each worker can do
+all of this, without another package.
 """
 
 import contextlib
@@ -21,21 +21,21 @@ from rotflex_jax.batch.task import Record, SearchTask, carry_out, prepared, reco
 from rotflex_jax.errors import InputError, optional
 from rotflex_jax.runtime.xla import bind_to_cores, cores, enable_fast_start
 
-# Attempts at a recording whose process dies.
+# Largest number of attempts at a recording whose process dies.
 MOST_ATTEMPTS = 3
-# Memory of a process [bytes]: as much is reserved for each, and a process with more is replaced by a new one
-# before its next recording. Most of it is compiled code, which is read from disk again.
+# Memory of a process [bytes]: this much is reserved for each. A process with more is replaced by a new one
+# before its next recording; most of its memory is compiled code, which is read from disk again.
 PROCESS_MEMORY = 3.5e9
 
 
 def in_processes(jobs: Iterable[tuple[int, SearchTask]], workers: int) -> Generator[tuple[int, Record]]:
-    """Searches recordings in parallel, and yields each result as soon as it is there.
+    """Searches recordings in parallel, and yields each result as soon as it is available.
 
-    A recording whose process dies is searched again in a new one; the others are not affected.
+    A recording whose process dies is searched again in a new process; the others are not affected.
 
     Args:
-        jobs: Number and task; taken when a process is free.
-        workers: Most processes.
+        jobs: Number and task of each recording; taken when a process is free.
+        workers: Largest number of processes.
 
     Raises:
         InputError: No process could start.
@@ -57,7 +57,7 @@ def in_processes(jobs: Iterable[tuple[int, SearchTask]], workers: int) -> Genera
                 following = next(jobs, None)
                 if following is None:
                     busy.remove(worker)
-                    worker.pipe.close()  # which ends the process
+                    worker.pipe.close()  # this ends the process
                 else:
                     worker.take(*following)
     finally:
@@ -66,7 +66,7 @@ def in_processes(jobs: Iterable[tuple[int, SearchTask]], workers: int) -> Genera
 
 
 def workers_here() -> int:
-    """As many processes as this machine has cores and memory for."""
+    """Number of processes for which this machine has cores and memory."""
     try:
         memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     except (AttributeError, ValueError, OSError):  # not known on this system
@@ -83,7 +83,7 @@ class _Worker:
         self._start()
 
     def _start(self) -> None:
-        # Spawned, since a fork of a process that has used JAX may hang.
+        # Spawned, because a fork of a process that has used JAX may hang.
         context = get_context("spawn")
         self.pipe, other_end = context.Pipe()
         self.process = context.Process(
@@ -105,7 +105,7 @@ class _Worker:
             self.pipe.send(self.task)
 
     def receive(self) -> Record | None:
-        """The result; None where the process has only just started and now received its task."""
+        """The result; None if the process has just started and only now receives its task."""
         found: Any = self.pipe.recv()
         if found is None:
             self.started = True
@@ -113,7 +113,7 @@ class _Worker:
         return found
 
     def restart(self) -> Record | None:
-        """Starts the recording again in a new process; after too many attempts a record of the failure."""
+        """Starts the recording again in a new process; after too many attempts, a record of the failure."""
         self.pipe.close()
         self.process.join()
         status = self.process.exitcode
@@ -122,7 +122,7 @@ class _Worker:
                 f"A worker process ended before it could begin (exit status {status}), but a fleet needs "
                 'some; in a script, call fleet below `if __name__ == "__main__":`.'
             )
-        self.deaths += status != 0  # with 0 it ended itself for its memory, before this task
+        self.deaths += status != 0  # status 0: it ended by itself because of its memory, before this task
         if self.deaths == MOST_ATTEMPTS:
             attempts = f"It ended its process {MOST_ATTEMPTS} times"
             return record("broken", f"{attempts} (exit status {status}): too little memory?")
@@ -131,7 +131,7 @@ class _Worker:
 
 
 def _serve(pipe: Any, memory: float, share: tuple[int, int]) -> None:
-    """Main loop of a worker process, until there is nothing left to do or it uses too much memory."""
+    """Main loop of a worker process, until there is no more task or it uses too much memory."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes; the parent ends this one
     bind_to_cores(*share)
     enable_fast_start()
@@ -143,27 +143,27 @@ def _serve(pipe: Any, memory: float, share: tuple[int, int]) -> None:
 
 
 def _memory() -> float:
-    """Of this process [bytes]; 0 where it is not known (anywhere but on Linux)."""
+    """Memory of this process [bytes]; 0 on systems other than Linux, where it is not known."""
     file = Path("/proc/self/statm")
     return int(file.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") if file.exists() else 0.0
 
 
-# Longest wait for the answer of a scheduler [s], and recordings queued there beyond one per worker thread.
+# Longest wait for the answer of a scheduler [s], and recordings in its queue beyond one per worker thread.
 SCHEDULER_TIMEOUT, QUEUED_RECORDINGS = 10, 4
 
 
 def on_cluster(jobs: Iterable[tuple[int, SearchTask]], scheduler: str) -> Generator[tuple[int, Record]]:
-    """Searches recordings on a cluster, and yields each result as soon as it is there.
+    """Searches recordings on a cluster, and yields each result as soon as it is available.
 
-    The scheduler gives a recording whose worker died to another one. Only a few more recordings than
-    there are workers are queued at the scheduler at any time, so a million of them need no memory there.
+    The scheduler gives a recording whose worker died to another worker. Only a few more recordings than there
+    are workers are queued at the scheduler at any time, so a million of them need no memory there.
 
     Args:
-        jobs: Number and task; taken when a worker will soon be free.
-        scheduler: Its address, `tcp://HOST:8786`.
+        jobs: Number and task of each recording; taken when a worker will soon be free.
+        scheduler: Address of the scheduler, `tcp://HOST:8786`.
 
     Raises:
-        InputError: Dask is not installed, no scheduler answers, or it went away.
+        InputError: Dask is not installed, no scheduler answers, or the scheduler stops.
     """
     distributed: Any = optional("distributed", "A fleet on a scheduler")
     try:
@@ -177,7 +177,7 @@ def on_cluster(jobs: Iterable[tuple[int, SearchTask]], scheduler: str) -> Genera
         f"The scheduler at {scheduler} went away; start it again and repeat the call, which goes on where it "
         "stopped."
     )
-    # Of a scheduler that is gone every call fails in its own way.
+    # When the scheduler is gone, each kind of call fails in a different way.
     lost = (OSError, TimeoutError, CancelledError, RuntimeError)
     jobs, running = iter(jobs), {}
     with _without_its_log(), client:
@@ -220,8 +220,8 @@ def on_cluster(jobs: Iterable[tuple[int, SearchTask]], scheduler: str) -> Genera
 
 @contextlib.contextmanager
 def _without_its_log() -> Iterator[None]:
-    """Dask logs the loss of a scheduler with its tracebacks, and again while it tries to connect."""
-    # Each of its parts has a level of its own.
+    """Silences Dask, which logs the loss of a scheduler with tracebacks, repeatedly while it reconnects."""
+    # Each part of Dask has a log level of its own.
     parts = [name for name in logging.root.manager.loggerDict if name.partition(".")[0] == "distributed"]
     levels = {log: log.level for log in map(logging.getLogger, ("distributed", *parts))}
     for log in levels:

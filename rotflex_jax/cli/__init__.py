@@ -11,14 +11,15 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     """Run the command line and leave with its exit status.
 
     Args:
-        arguments: Those of the process if None. Where another program gives them, its signals are its own.
+        arguments: Arguments, or None for those of the process. If another program gives them, it keeps its
+            own handling of signals.
     """
     if arguments is None:
         from rotflex_jax.cli.stopping import STOP
 
         STOP.listen()  # before anything else is loaded
-        # XLA reports steps of its compiler that did not converge as errors, though the program is right. What
-        # fails raises; the variable is read when JAX is imported.
+        # XLA logs compiler passes that did not converge as errors, although the program is right. A real
+        # failure raises an exception. The variable is read when JAX is imported.
         os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     from rotflex_jax.cli.app import main as run
 

@@ -59,7 +59,7 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
         _refuse(f"{error.filename or 'A file'} cannot be used: {error.strerror or error}.")
     except (KeyboardInterrupt, typer.Abort):
         status = STOPPED
-    if status == STOPPED:  # typer makes that of Ctrl-C, where the process is another program's
+    if status == STOPPED:  # typer returns it after Ctrl-C, if the process belongs to another program
         print("rotflex: stopped", file=sys.stderr)
     sys.exit(status if isinstance(status, int) else 0)
 
@@ -218,7 +218,7 @@ def _discover(
 
 @contextmanager
 def _each_by_itself() -> Iterator[Callable[[Callable[[], Any]], None]]:
-    """Writes one thing after the other: what fails costs none of the others, and is said at the end."""
+    """Writes one output after the other: a failure prevents none of the others and is reported at the end."""
     failed: list[Exception] = []
 
     def attempt(write: Callable[[], Any]) -> None:
@@ -235,7 +235,7 @@ def _each_by_itself() -> Iterator[Callable[[Callable[[], Any]], None]]:
 
 
 def _give(result: Any, show: Callable[[Any], None], json_file: Path | None) -> None:
-    """A result as JSON on stdout, or for a person and as JSON in a file."""
+    """Print a result as JSON; or print it for a person, and write it as JSON if a file is named."""
     if json_file != given.STDOUT:
         show(result)
     if json_file is None:
@@ -248,14 +248,14 @@ def _give(result: Any, show: Callable[[Any], None], json_file: Path | None) -> N
 
 
 def _report(result: Any, folder: Path | None, json_file: Path | None) -> None:
-    """Write the report, last of all: whatever fails in it costs nothing of a result given before.
+    """Write the report, last of all, so that a failure does not affect results that were given before.
 
     Raises:
-        InputError: It could not be written, with the reason.
+        InputError: The report could not be written; the message has the reason.
     """
     if folder is None:
         return
-    from rotflex_jax.discover.discovery import Discovery  # loaded by what made the result
+    from rotflex_jax.discover.discovery import Discovery  # already loaded by the command
 
     try:
         with terminal.progress("Writing the report") as step:

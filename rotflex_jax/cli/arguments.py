@@ -343,7 +343,7 @@ def check_distinct(files: Sequence[Path], held_out: Sequence[Path]) -> None:
     """Refuse a file that is given twice: the error on data that were fitted proves nothing."""
     seen: dict[str, Path] = {}
     for file in (*files, *held_out):
-        place = os.path.realpath(file)  # also where links go round in a circle
+        place = os.path.realpath(file)  # works also if links form a cycle
         if place in seen:
             raise InputError(
                 f"{file} was given twice, but a recording must not count twice nor be both fitted "
@@ -370,7 +370,7 @@ def check_split(split: float | None, held_out: Sequence[Path]) -> float:
 
 
 def check_writable(*, json_file: Path | None = None, folder: Path | None = None) -> None:
-    """Refuse a place that nothing can be written to, while nothing has been computed yet."""
+    """Refuse an output file or folder that cannot be written, before anything is computed."""
     if json_file not in (None, STDOUT):
         if json_file.is_dir():
             raise InputError(f"{json_file} is a folder, but a file is written; name the file.")
@@ -381,7 +381,7 @@ def check_writable(*, json_file: Path | None = None, folder: Path | None = None)
 
 
 def _check_folder(folder: Path) -> None:
-    """Refuse a folder that cannot be made or written to; what is made to see that is taken away again."""
+    """Refuse a folder that cannot be created or written to; folders created for this test are removed."""
     if folder.exists() and not folder.is_dir():
         raise InputError(f"{folder} is a file, but the report needs a folder; name another.")
     place = folder.absolute()

@@ -16,7 +16,7 @@ SUMMARY_FOLDER = Path("rotflex-each")
 
 
 def check_each(each: bool, only: Mapping[str, Any], never: Mapping[str, Any]) -> None:
-    """Refuse options that go only with --each, or never."""
+    """Refuse options that need --each if it is missing, and options that exclude --each if it is given."""
     for name, value in (never if each else only).items():
         if value is None or value == []:
             continue
@@ -47,7 +47,7 @@ def search_each(
     from rotflex_jax.discover import discover
     from rotflex_jax.runtime.xla import enable_fast_start
 
-    # Results of searches as usual are those of `rotflex_jax.fleet` as usual.
+    # With the usual value no `search` is given, so that the results are those of a usual `rotflex_jax.fleet`.
     usual = inspect.signature(discover).parameters["calibrate_seconds"].default
     options: dict[str, Any] = {}
     if calibrate_seconds != usual:

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from rotflex_jax.models.model import Model
     from rotflex_jax.recording import Recording
 
-# A shorter recording has too few reversals to fit and to validate on [s].
+# Shortest recording without a note [s]; a shorter one has too few reversals to fit and to validate.
 SHORTEST_FOR_SEARCH = 5.0
 
 data_app = typer.Typer(help="Public recordings: list them, fetch them.")
@@ -91,7 +91,7 @@ def check(
 
 
 def _say_what_can_be_known(model: "Model", recording: "Recording", joint: str) -> None:
-    """Which parameters of a model a recording determines, at the values that the model starts with."""
+    """Print which parameters of a model a recording determines, at the model's own parameter values."""
     from rotflex_jax.fit.identifiable import identifiable
 
     if not model.mechanism.free_names:

@@ -16,7 +16,7 @@ from rotflex_jax.joints import by_name
 from rotflex_jax.text.files import write_file
 from rotflex_jax.text.numbers import digits
 
-# Options that the first command of an experiment has, and its state from there on.
+# Options of the first command of an experiment; later commands take them from its state.
 FIRST_COMMAND = (
     "fit",
     "between",
@@ -190,7 +190,7 @@ def experiment(
 def _continued(
     state: Path, recording: Path | None, columns: Any, save: Path | None, json_file: Path | None, first: bool
 ) -> None:
-    """One step of an experiment that stops by itself: what was recorded in, the next voltage out."""
+    """One step of a sequential experiment: evaluate a recording, then write the next voltage."""
     from rotflex_jax.experiment.sequential import SequentialExperiment
 
     if recording is None:
@@ -221,7 +221,7 @@ def _continued(
 
 
 def _report(e: Any, state: Path, save: Path | None, json_file: Path | None) -> None:
-    """Keep the state, write the next voltage, say how it stands."""
+    """Save the state, write the next voltage, and print the result so far."""
     result, voltage = e.result(), None
     if e.planned is not None:
         voltage = save or _voltage_file(state, len(e.history) + 1)
@@ -246,19 +246,19 @@ def _report(e: Any, state: Path, save: Path | None, json_file: Path | None) -> N
 
 
 def _voltage_file(state: Path, count: int) -> Path:
-    """Where the voltage of a segment goes unless a file is named."""
+    """File for the voltage of a segment, used unless another file is named."""
     return state.with_name(f"{state.stem}_{count:03d}.csv")
 
 
 def _check_voltage_file(state: Path, save: Path | None, count: int, read: Sequence[Path]) -> None:
-    """Refuse to write a voltage over the state, a recording that is read, or a file that nobody named."""
+    """Refuse to overwrite the state, a recording that is read, or an existing file that was not named."""
     file = save or _voltage_file(state, count)
     if file.resolve() in {path.resolve() for path in (state, *read)} or (save is None and file.exists()):
         raise InputError(f"The next voltage would be written over {file}; name another file with --save.")
 
 
 def _write_files(found: Any, save: Path | None, plot: Path | None) -> None:
-    """The input, then its figure in the format that the name of the file ends in."""
+    """Write the input, then its figure in the format given by the ending of the file's name."""
     if save is not None:
         found.save_csv(save)
     if plot is not None:

@@ -44,7 +44,7 @@ def simulate(
         with terminal.progress("Fitting") as step:
 
             def tell(line: str) -> None:
-                if " steps, " not in line:  # each would be a line where this is no terminal
+                if " steps, " not in line:  # without a terminal, each would be a line of its own
                     step(line)
 
             fitted = rf.fit(model, train, progress=tell)

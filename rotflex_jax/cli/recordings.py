@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 # Joints that can have one sensor alone.
 ONE_SENSOR = ("paper", "quanser_2002", "quanser_2010")
 
-# Substeps within which a smooth input is followed.
+# Smallest number of substeps for a smooth input.
 SMOOTH_SUBSTEPS = 4
 
 
@@ -53,7 +53,7 @@ class Columns:
     resample: Resample = None
     intersample: Intersample = "held"
     substeps: Substeps = None
-    mechanism: Any = None  # whose channels and signals are read where the options name none
+    mechanism: Any = None  # its channels and signals are read if the options name none
 
     def __post_init__(self) -> None:
         if self.Ts is not None and self.time is not None:
@@ -78,7 +78,7 @@ class Columns:
             )
 
     def of(self, model: "Model") -> "tuple[Model, Columns]":
-        """The model with the integration that the options ask for, and how to read its recordings."""
+        """The model with the integration that the options select, and how to read its recordings."""
         if self.intersample == "smooth":
             solver = model.solver
             if not hasattr(solver, "between"):
@@ -128,7 +128,7 @@ class Columns:
         return recording
 
     def reading(self) -> dict[str, Any]:
-        """The same as arguments of `rotflex_jax.load`."""
+        """The options as arguments of `rotflex_jax.load`."""
         from rotflex_jax.mechanism.linear import output_units
 
         units = {} if self.mechanism is None else output_units(self.mechanism)
@@ -151,7 +151,7 @@ class Columns:
         }
 
     def sensor_alone(self, file: Path) -> str | None:
-        """The one sensor of a joint that the options name, or that a file has; None where it is not one."""
+        """The only sensor of a joint that the options name or that a file has; None if it is not just one."""
         from rotflex_jax.data.columns import OTHER_NAMES
         from rotflex_jax.data.files import read_table
         from rotflex_jax.joints.rotary_flexible import SENSORS
@@ -162,12 +162,12 @@ class Columns:
         try:
             table = read_table(file)
         except (InputError, OSError):
-            return None  # whoever loads it says why
+            return None  # loading the file later reports the reason
         found = [c for c in SENSORS if table.find(c, *OTHER_NAMES.get(c, ())) in table.columns]
         return found[0] if found and (len(found) == 1 or "alpha" not in found) else None
 
     def load_all(self, files: Sequence[Path]) -> "list[Recording]":
-        """The recordings in files, and those of public data sets that are named in the place of a file."""
+        """Recordings from files, and from public data sets whose names are given in place of a file."""
         found: list[Recording] = []
         for file in files:
             if public_name(file) is None:
@@ -187,7 +187,7 @@ class Columns:
     def load_parts(
         self, files: Sequence[Path], held_out: Sequence[Path], share: float
     ) -> "tuple[list[Recording], list[Recording]]":
-        """Recordings to fit and held-out ones: files of their own, or the end of each file."""
+        """Recordings to fit and held-out recordings; these are separate files or the end of each file."""
         train = self.load_all(files)
         if held_out:
             return train, self.load_all(held_out)
@@ -199,7 +199,7 @@ Command = Callable[..., None]
 
 
 def reads_files(command: Command) -> Command:
-    """A command whose argument `columns` is made of the options that say how files are read."""
+    """A command with the options that state how to read files, which make its argument `columns`."""
     options = {f.name: f for f in dataclasses.fields(Columns) if f.name != "mechanism"}
     types = {name: f.type for name, f in options.items()}
 
@@ -241,7 +241,7 @@ def _counts(texts: Sequence[str]) -> float | dict[str, float] | None:
 
 
 def _period(text: str | None) -> float | str | None:
-    """Seconds, or the word auto."""
+    """Sampling period [s] or the word `auto`; None if neither was given."""
     if text in (None, "auto"):
         return text
     try:
@@ -306,7 +306,7 @@ def as_options(sentence: str) -> str:
 
 
 def public_name(file: Path) -> str | None:
-    """The name of a public data set that is given in the place of a file; None where there is such a file."""
+    """The name of a public data set that is given in place of a file; None for anything else."""
     from rotflex_jax.data.registry import DATASETS
 
     name = str(file)
@@ -322,7 +322,7 @@ def public_name(file: Path) -> str | None:
 
 
 def _check_one_column(outputs: Sequence[str], joint: str) -> None:
-    """Refuses one column alone of which nothing says what sensor of a joint it is."""
+    """Refuse a single column if the options do not state which sensor of a joint it is."""
     if len(outputs) == 1 and "=" not in outputs[0]:
         raise InputError(
             f"--output was given {outputs[0]!r} alone, but the joint {joint} has two sensors, and nothing "
@@ -332,12 +332,12 @@ def _check_one_column(outputs: Sequence[str], joint: str) -> None:
 
 
 def joint_for(files: Sequence[Path], joint: str, columns: Columns) -> str:
-    """The joint that was given, or that of the public data set where all files are its name.
+    """The joint that was given, or the joint of a public data set if its name is given in place of files.
 
-    A joint of which the files have one sensor alone becomes one with that sensor.
+    If the files have only one sensor of the joint, the joint has only this sensor.
 
     Raises:
-        InputError: One column is named whose name is no sensor's.
+        InputError: A single column is named, but not the sensor that it belongs to.
     """
     from rotflex_jax.data.registry import DATASETS
 

@@ -90,7 +90,7 @@ def _pairs(texts: list[str]) -> dict[str, str]:
 
 
 def _recordings(columns: Columns, data: list[str], held_out: list[Path], share: float) -> tuple[Any, ...]:
-    """Recordings to fit and held-out ones; nothing for a simulation."""
+    """Recordings to fit and held-out recordings; empty for a simulation."""
     if not data:
         if columns.Ts is not None:
             raise InputError(

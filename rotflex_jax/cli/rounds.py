@@ -1,4 +1,4 @@
-"""The rounds that a search has finished stay in a file until it has ended."""
+"""Finished rounds of a search are kept in a file until the search has ended."""
 
 import json
 from collections.abc import Callable
@@ -12,12 +12,12 @@ from rotflex_jax.text.numbers import json_numbers
 
 
 class RoundsSoFar:
-    """Keeps the models that a search has reached in `NAME.stopped.json`, beside its result to be.
+    """Keeps the models that a search has reached in `NAME.stopped.json`, beside the file of its result.
 
     A result of an earlier search stays as it is until the new one is complete.
 
     Args:
-        json_file: Where the result goes; None or "-" where it goes to no file, and nothing is kept.
+        json_file: File of the result. With None or "-" there is no such file, and nothing is kept.
     """
 
     def __init__(self, json_file: Path | None) -> None:
@@ -27,7 +27,7 @@ class RoundsSoFar:
         self._stages: list[dict[str, Any]] = []
 
     def following(self, step: Callable[[str], None]) -> Callable[[str], None]:
-        """The same function of a line of progress; lines that tell of a model reached are kept too."""
+        """A function that passes lines of progress to `step` and keeps the models that they report."""
 
         def follow(line: str) -> None:
             errors = getattr(line, "errors", None)
@@ -43,14 +43,14 @@ class RoundsSoFar:
         return follow
 
     def _write(self, file: Path) -> None:
-        # A search that goes on comes by the rounds of the file again, and must not lose them if it is killed.
+        # A continued search passes the rounds of the file again, and must not lose them if it is killed.
         stages = _longer(file, self._stages) or self._stages
         kept = {"schema": 1, "stopped": True, "stages": stages}
         if stages is self._stages:
             try:
                 write_file(file, json.dumps(kept, indent=2) + "\n")
             except InputError:
-                return  # the search is worth more than its trace
+                return  # a file that cannot be written must not end the search
         done = len(stages) - 1
         rounds = "one finished round" if done == 1 else f"{done} finished rounds"
         STOP.kept = (
@@ -59,14 +59,14 @@ class RoundsSoFar:
         )
 
     def remove(self) -> None:
-        """Nothing is kept of a search that has ended."""
+        """Remove the file of a search that has ended."""
         STOP.kept = ""
         if self.file is not None and self._stages:
             self.file.unlink(missing_ok=True)
 
 
 def _longer(file: Path, stages: list[dict[str, Any]]) -> list[Any] | None:
-    """What a file has kept of the same search, where that begins with these stages and has more of them."""
+    """Stages of the same search in a file, if they begin with these stages and are more; otherwise None."""
     try:
         known = json.loads(file.read_text(encoding="utf-8"))["stages"]
         begins = [(a["model"], a["search"]["digest"]) for a in known[: len(stages)]]
@@ -77,5 +77,5 @@ def _longer(file: Path, stages: list[dict[str, Any]]) -> list[Any] | None:
 
 
 def _is_special(path: Path) -> bool:
-    """A device or a pipe, beside which nothing is kept."""
+    """Whether a path is a device or a pipe, beside which nothing is kept."""
     return path.exists() and not path.is_file()

@@ -1,9 +1,9 @@
 """Ctrl-C ends the command line at once.
 
-An exception would arrive in the middle of an import, in a callback of the garbage collector, or only after a
-minute of compiled code, and end with a traceback in some of these. Files are written whole or not at all and
-results as soon as they are there, so that an end at any moment costs only what was not finished. This module
-imports as little as it can, since the signal is not heard before it is loaded.
+A `KeyboardInterrupt` could arrive in the middle of an import, in a callback of the garbage collector, or only
+after a minute of compiled code, and in some of these cases it ends with a traceback. Files are written
+completely or not at all, and results are written as soon as they exist. So an end at any moment loses only
+unfinished work. This module imports as little as possible, because Ctrl-C is not handled before it is loaded.
 """
 
 import os
@@ -25,7 +25,7 @@ class Stop:
     """The end of this process by Ctrl-C.
 
     Attributes:
-        kept: What a user is told of results that were kept.
+        kept: Message to the user about results that were kept.
     """
 
     def __init__(self) -> None:
@@ -33,7 +33,7 @@ class Stop:
         self._once = threading.Lock()
 
     def listen(self) -> None:
-        """From now on Ctrl-C ends the process: in the main thread, or in one that waits for the signal."""
+        """From now on Ctrl-C ends the process, from the main thread or from a thread that waits for it."""
         if threading.current_thread() is not threading.main_thread():
             return
         signal.signal(signal.SIGINT, self)
@@ -50,20 +50,21 @@ class Stop:
         self()
 
     def __call__(self, *_: Any) -> NoReturn:
-        """Say so, end the worker processes, leave."""
+        """Print a message, end the worker processes and exit."""
         if not self._once.acquire(blocking=False):
             while True:  # the other thread is about to end the process
                 time.sleep(1)
-        # The other thread may hold a lock for good that is needed here, such as that of a pipe nobody reads.
+        # The other thread may hold a lock forever that is needed here, such as the lock of a pipe that nobody
+        # reads.
         with suppress(Exception):
             limit = threading.Timer(LONGEST_END, os._exit, (STOPPED,))
             limit.daemon = True
             limit.start()
-        # The line of a spinner is cleared, and the cursor that it has hidden comes back.
+        # Clear the line of a spinner, and show the cursor that the spinner has hidden.
         clear = "\r\x1b[K\x1b[?25h" if os.isatty(2) else ""
         with suppress(OSError):
             os.write(2, f"{clear}rotflex: stopped{f'; {self.kept}' if self.kept else ''}\n".encode())
-        # An import would wait for the main thread where that is importing the same module.
+        # No import here: it would wait for the main thread if that is importing the same module.
         with suppress(Exception):
             for child in getattr(sys.modules.get("multiprocessing.process"), "active_children", list)():
                 child.kill()

@@ -21,7 +21,7 @@ from rotflex_jax.text.numbers import digits, one_line, printable, readable, spre
 
 # Rows of a long table that are shown.
 LISTED_RECORDINGS = 60
-# Work says something so often [s], and says a long line again with so many characters of it.
+# Longest time without a line of progress [s]; largest length of a line that is repeated [characters].
 SILENCE, LONGEST_AGAIN = 10.0, 60
 
 
@@ -46,14 +46,14 @@ def output() -> Console:
 
 
 class _Told:
-    """The last line of progress, with how long it has stood there."""
+    """The last line of progress, and the time since it was shown."""
 
     def __init__(self, title: str) -> None:
         self.line, self.time_left = title, None
         self.began = self.since = self.shown = time.monotonic()
 
     def take(self, step: str) -> str:
-        """A new line, as it is shown."""
+        """Store a new line and return the text to show."""
         if self.time_left is None and hasattr(step, "kind"):  # a search has begun
             from rotflex_jax.discover.checkpoint import TimeLeft
 
@@ -68,7 +68,7 @@ class _Told:
         return self.time_left.words() if self.time_left else f"{time.monotonic() - self.began:.0f} s so far"
 
     def again(self) -> str:
-        """The same line, after a while without another one."""
+        """The text to show after a while without a new line: the last line with its time so far."""
         self.shown = time.monotonic()
         line = self.line.strip()
         short = line if len(line) <= LONGEST_AGAIN else line[: LONGEST_AGAIN - 1].rsplit(" ", 1)[0] + " …"
@@ -79,8 +79,8 @@ class _Told:
 def progress(title: str) -> Iterator[Callable[[str], None]]:
     """Show what long work is doing: a spinner on a terminal, one line per step elsewhere.
 
-    Each step has the time so far, and in a search what is left of it where that can be told. Where no step
-    ends for `SILENCE` seconds, the last one is said again with how long it has taken.
+    Each step has the time so far, and in a search the remaining time if it can be estimated. If no step is
+    reported for `SILENCE` seconds, the last one is repeated with its time so far.
 
     Args:
         title: What is shown until the work reports its first step.
@@ -104,7 +104,7 @@ def progress(title: str) -> Iterator[Callable[[str], None]]:
 def _repeating(
     told: _Told, show: Callable[[str], None], every: float, ended: threading.Event
 ) -> Iterator[None]:
-    """Says the last line again where nothing was said for so many seconds."""
+    """Repeats the last line whenever nothing was shown for `every` seconds."""
 
     def watch() -> None:
         while not ended.wait(min(every / 4, 1.0)):
@@ -121,8 +121,8 @@ def _repeating(
 
 
 def _named(step: str) -> str:
-    """A line of progress with effects as they are called elsewhere."""
-    from rotflex_jax.effects.labels import with_titles  # long after `--help` was answered
+    """A line of progress, with effects named by their nouns."""
+    from rotflex_jax.effects.labels import with_titles  # imported here, so that `--help` answers at once
 
     return with_titles(step)
 
@@ -156,7 +156,7 @@ def estimate_line(name: str, estimate: Any) -> str:
 
 
 def print_discovery(result: Any) -> None:
-    """Verdict, rounds, errors on validation and test data, and where the model failed.
+    """Print verdict, rounds, errors on validation and test data, and where the baseline failed.
 
     Parameters are those of the model to use.
     """
@@ -212,14 +212,14 @@ def print_discovery(result: Any) -> None:
 
 
 def print_comparison(result: Any) -> None:
-    """Methods side by side, best first."""
+    """Print methods side by side, best first."""
     console = output()
     console.print("Free runs over the held-out data", style="bold")
     console.print(str(result), markup=False)
 
 
 def print_fleet(result: Any, reworded: Callable[[str], str]) -> None:
-    """One line a recording, and the counts."""
+    """Print one line for each recording, and the counts."""
     good = [row for row in result.rows if row.verdict]
     rows = [
         (
@@ -244,7 +244,7 @@ def print_fleet(result: Any, reworded: Callable[[str], str]) -> None:
 
 
 def print_findings(recordings: Sequence[Any]) -> None:
-    """Findings that a user should check before trusting a result, once each, on stderr."""
+    """Print findings that a user should check before trusting a result, once each, on stderr."""
     seen: set[tuple[str, str, str]] = set()
     for recording in recordings:
         for finding in recording.findings:
@@ -256,8 +256,8 @@ def print_findings(recordings: Sequence[Any]) -> None:
 
 
 def print_recording(recording: Any) -> None:
-    """What was measured: extent, ranges, steps of the sensors, and everything that was noticed."""
-    from rotflex_jax.recording.samples import name_and_unit  # long after `--help` was answered
+    """Print what was measured: length, ranges, steps of the sensors, and all findings."""
+    from rotflex_jax.recording.samples import name_and_unit  # imported here, so that `--help` answers at once
 
     about = f"{recording.N} samples, {recording.duration:g} s at {1 / recording.Ts:g} Hz"
     message(f"{recording.source}: {about}" if recording.source else about)
@@ -275,13 +275,13 @@ def print_recording(recording: Any) -> None:
 
 
 def print_remarks(fitted: Any, label: str = "", *, error: bool = False) -> None:
-    """What a fit remarks on its parameters, each as a note; with a label where there are several fits."""
+    """Print the remarks of a fit on its parameters as notes, with a label if there are several fits."""
     for remark in fitted.remarks:
         message(f"note: {f'{label}: ' if label else ''}{remark.sentence}.", error=error)
 
 
 def message(text: str, *, error: bool = False) -> None:
-    """One line for a person."""
+    """Print one line for a person."""
     SafeConsole(stderr=error, highlight=False).print(text, markup=False, soft_wrap=True)
 
 
@@ -303,7 +303,7 @@ def save_simulation(file: Path, recording: Any, simulated: Mapping[str, Real[np.
 
 
 def print_rows(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """A plain table of texts."""
+    """Print a plain table of texts."""
     table = Table(box=None, pad_edge=False, header_style="bold")
     for heading in headings:
         table.add_column(cell(heading))
@@ -313,7 +313,7 @@ def print_rows(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
 
 
 def print_effects(descriptions: Sequence[Mapping[str, Any]]) -> None:
-    """The catalogue of effects as a table."""
+    """Print the catalogue of effects as a table."""
     rows = []
     for effect in descriptions:
         parameters = (
@@ -326,7 +326,7 @@ def print_effects(descriptions: Sequence[Mapping[str, Any]]) -> None:
 
 
 def print_arena(seed: int, headings: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """Scores of methods, one row each."""
+    """Print scores of methods, one row each."""
     table = Table(title=f"Arena, seed {seed}", title_justify="left")
     for heading in ("method", *headings):
         table.add_column(heading, justify="left" if heading == "method" else "right")

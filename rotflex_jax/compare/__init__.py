@@ -1,4 +1,4 @@
-"""Every method on the same recording: same split, same first samples, free runs only."""
+"""Comparison of methods on the same recordings: same split, same first samples, free runs only."""
 
 from rotflex_jax.compare.adaptive_series import AdaptiveSeries
 from rotflex_jax.compare.arx import ARX
@@ -17,7 +17,7 @@ from rotflex_jax.compare.series import RIDGES, BatchSeries
 from rotflex_jax.compare.sindy import SINDy
 from rotflex_jax.compare.table import Comparison, Row
 
-# The order in which they run; one more method is one more line.
+# The methods run in this order; each further method is one more line.
 register(Textbook())
 register(LinearPart())
 register(GreyBox())

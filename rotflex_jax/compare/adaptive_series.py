@@ -1,4 +1,4 @@
-"""Volterra series adapted sample by sample: LMS and its relatives, with settings by grid or by gradient."""
+"""Volterra series that are adapted sample by sample (LMS, NLMS, RLS, Kalman), with tuned settings."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -34,24 +34,24 @@ FilterRule = Literal["lms", "nlms", "rls", "kalman"]
 class AdaptiveSeries:
     """A Volterra series whose weights are adapted by a filter, then frozen.
 
-    Bank, time scale, and output or rate are those that batch least squares chooses, so that the filter
-    alone makes the difference. A rate is learned from changes of the output over `n_init` samples, since
-    those of one sample are mostly noise. Settings are chosen on halves of the recordings, each validated
-    on the others; the number of passes, by the free run over the last part. Not the way to use a whole
-    recording: least squares is exact, and LMS only approaches it.
+    Bank, time scale, and series of output or rate are chosen by batch least squares, so that the filter alone
+    makes the difference. A rate is learned from changes of the output over `n_init` samples, because changes
+    over one sample are mostly noise. The settings of the filter are chosen on halves of the recordings, each
+    validated on the others; the number of passes is chosen by the free run over the last part. Not the best
+    use of a whole recording: least squares is exact, and LMS only approaches it.
 
     Source: Mathews and Sicuranza 2000, Polynomial Signal Processing; Haykin 2002.
 
     Attributes:
-        name: Short.
-        title: In words.
+        name: Short name.
+        title: Description in words.
         rule: Kind of filter.
-        gradient: Settings by gradient through the filter instead of by a grid.
+        gradient: Whether settings are tuned by the gradient through the filter instead of by a grid.
         bank: Kind of the bank.
-        order: Of the Volterra series.
-        count: Columns of the bank.
-        passes: Passes through the recordings at most; one for filters with unlimited memory.
-        share: First part of each recording; the rest is for validation.
+        order: Order of the Volterra series.
+        count: Number of columns of the bank.
+        passes: Largest number of passes through the recordings; RLS and Kalman filters make one pass.
+        share: Share of each recording in the first part; the rest is for validation.
     """
 
     name: str
@@ -66,7 +66,7 @@ class AdaptiveSeries:
     family: str = "adaptive"
 
     def fit(self, model: Model, train: Sequence[Recording], say: Progress) -> Fitted:
-        """Ignores the model."""
+        """Choose a series for each output and adapt its weights; `model` is ignored."""
         require_one_sampling_period(train, "a series")
         candidates = [Volterra(b, self.order) for b in candidate_banks(self.bank, self.count, train)]
         choices, adapted, phrases = [], [], []
@@ -81,7 +81,7 @@ class AdaptiveSeries:
         return Fitted(result, result.parameters, words, result.predict)
 
     def _adapt(self, batch: ChannelSeries, train: Sequence[Recording], c: int) -> tuple[ChannelSeries, str]:
-        """Weights of the filter on the basis of a batch fit, and its settings in words."""
+        """The series with weights of the filter, on the basis of a batch fit, and the settings in words."""
         rows = [SeriesRegression.of(batch.basis, r, c, batch.integrates) for r in train]
         hold = train[0].n_init if batch.integrates else 0
         data = [_training_rows(x, hold) for x in rows]
@@ -113,7 +113,7 @@ class AdaptiveSeries:
     def _settings(
         self, basis: "NormalisedSeries", halves: Sequence[Recording], noise: float
     ) -> tuple[str, AdaptiveFilter]:
-        """Settings of the filter with the least error of its last weights on the other halves."""
+        """Settings in words and filter with the least error of its last weights on the other halves."""
         P, rule = basis.size, self.rule
         build = FilterFactory(rule, tuple((basis.degrees > 1).tolist()), noise)
         axes: dict[str, Any] = {
@@ -132,7 +132,7 @@ class AdaptiveSeries:
 
 @dataclasses.dataclass(frozen=True)
 class FilterFactory:
-    """Makes the filter of settings by name; equal objects share one compilation."""
+    """Makes a filter from named settings; equal factories share one compilation."""
 
     rule: str
     products: tuple[bool, ...]
@@ -150,7 +150,7 @@ class FilterFactory:
 
 
 class NormalisedSeries(eqx.Module):
-    """Regressors of a series scaled to size one, or their sums over the samples of a change of the output."""
+    """Regressors of a series scaled to size one; for a rate, their integrals over `hold` samples."""
 
     basis: Volterra
     scale: Any
@@ -167,7 +167,7 @@ class NormalisedSeries(eqx.Module):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the regressors."""
+        """Names of the regressors."""
         return self.basis.names
 
     @property
@@ -176,11 +176,11 @@ class NormalisedSeries(eqx.Module):
         return self.basis.degrees
 
     def units(self, input_unit: str = "V", output_unit: str = "rad") -> tuple[str, ...]:
-        """Of the weights: all of size one."""
+        """Units of the weights: all 1, because regressors and output are scaled to size one."""
         return ("1",) * self.size
 
     def kernels(self, w: Any, length: int | None = None) -> Mapping[int, Any]:
-        """Of the weights of the series before scaling."""
+        """Kernels for the weights of the series before scaling."""
         return self.basis.kernels(np.asarray(w) / self.scale, length)
 
     def respond(self, u: Float[Array, " N"]) -> Float[Array, "N P"]:
@@ -193,12 +193,12 @@ class NormalisedSeries(eqx.Module):
         return phi / jnp.asarray(self.scale)[None, :]
 
     def regressors(self, u: Any) -> Float[np.ndarray, "N P"]:
-        """The same as an array."""
+        """Regressors for a signal, as a numpy array."""
         return np.asarray(self.respond(jnp.asarray(u)))
 
 
 def _training_rows(x: SeriesRegression, hold: int) -> Float[np.ndarray, "N K"]:
-    """Regressors and output, or their changes; rows that are zero have no influence."""
+    """Regressors and output, or their changes over `hold` samples; zero rows have no influence."""
     joined = np.column_stack([x.phi, x.y])
     if hold:
         joined[hold:] = joined[hold:] - joined[:-hold]
@@ -207,7 +207,7 @@ def _training_rows(x: SeriesRegression, hold: int) -> Float[np.ndarray, "N K"]:
 
 
 def _equal_parts(r: Recording, c: int, hold: int, size: float, length: int) -> list[Recording]:
-    """Parts of one length, with the output or its changes as the only channel."""
+    """Parts of equal length, with the output or its changes as the only channel."""
     y = r.y[:, [c]].astype(float)
     if hold:
         y[hold:] = y[hold:] - r.y[:-hold, [c]]

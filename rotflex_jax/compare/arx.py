@@ -22,15 +22,15 @@ from rotflex_jax.recording.samples import require_period
 
 @dataclasses.dataclass(frozen=True)
 class DifferenceEquation:
-    """A linear difference equation of all outputs together.
+    """A linear difference equation for all outputs together.
 
         y[k] = A_1 y[k-1] + ... + A_n y[k-n] + B_1 u[k-1] + ... + B_n u[k-n]
 
     Attributes:
         A: Coefficients of the outputs, oldest sample first.
         B: Coefficients of the m inputs, oldest sample first: the input, then the signals.
-        Ts: Sampling period it holds for [s].
-        signals: Names of the signals that it takes beside the input.
+        Ts: Sampling period for which the equation holds [s].
+        signals: Names of the signals that are inputs too.
     """
 
     A: Float[np.ndarray, "C n C"]
@@ -40,11 +40,11 @@ class DifferenceEquation:
 
     @property
     def order(self) -> int:
-        """Number of past samples that it uses."""
+        """Number of past samples that the equation uses."""
         return self.B.shape[1]
 
     def predict(self, recording: Recording) -> Float[np.ndarray, "N C"]:
-        """One step ahead; the first samples, which it starts from, as measured."""
+        """One-step-ahead prediction; the first `order` samples are as measured."""
         n, C, y = self.order, len(self.B), recording.y.astype(float)
         ahead = (
             _lags(y, n) @ self.A.reshape(C, -1).T
@@ -53,10 +53,11 @@ class DifferenceEquation:
         return np.concatenate([y[:n], ahead])
 
     def simulate(self, recording: Recording) -> Float[np.ndarray, "N C"]:
-        """Free run: the first `n_init` samples as measured, from there on its own outputs.
+        """Free run: the first `n_init` samples are as measured, the others from simulated outputs.
 
         Raises:
-            InputError: Its order exceeds `n_init`, the sampling period is another, or a signal is missing.
+            InputError: The order exceeds `n_init`, the recording has another sampling period, or it lacks a
+                signal.
         """
         n, m, N = self.order, recording.n_init, recording.N
         if n > m:
@@ -83,15 +84,15 @@ class ARX:
 
     Signals that all recordings have are further inputs.
 
-    Its order is the one with the best free run over the last part of the training recordings. Not
-    for data with coarse sensors or noise at a high sampling rate: least squares takes the noise of
-    the regressors for dynamics.
+    The order is chosen by the best free run over the last part of the training recordings. Not for data with
+    coarse sensors or noise at a high sampling rate: least squares mistakes the noise of the regressors for
+    dynamics.
 
     Source: L. Ljung, System Identification, 2nd ed., 1999, section 4.2.
 
     Attributes:
         orders: Orders to choose from; those beyond `n_init` are left out.
-        share: Share of each training recording that orders are fitted to; the rest is for validation.
+        share: Share of each training recording to which the equations are fitted; the rest is for validation.
     """
 
     name: str = "arx"
@@ -101,7 +102,7 @@ class ARX:
     share: float = 0.7
 
     def fit(self, model: Model, train: Sequence[Recording], say: Progress) -> Fitted:
-        """Ignores the model."""
+        """Choose the order and fit the equation; `model` is ignored."""
         first, last = split_for_validation(train, self.share)
         longest = min(r.n_init for r in (*first, *last))
         orders = [n for n in self.orders if n <= longest]
@@ -120,11 +121,11 @@ class ARX:
 
 
 def fit_difference_equation(recordings: Sequence[Recording], order: int) -> DifferenceEquation:
-    """The equation of this order that predicts the next sample best.
+    """The equation of this order with the best prediction of the next sample.
 
     Args:
-        recordings: All with the same sampling period.
-        order: Past samples that the equation uses.
+        recordings: Recordings with the same sampling period.
+        order: Number of past samples that the equation uses.
     """
     C = recordings[0].y.shape[1]
     signals = common_signals(recordings)
@@ -141,6 +142,6 @@ def fit_difference_equation(recordings: Sequence[Recording], order: int) -> Diff
 
 
 def _lags(x: Float[np.ndarray, "N c"], n: int) -> Float[np.ndarray, "M K"]:
-    """The n samples before each from the n-th on: oldest sample first, columns side by side."""
+    """The n samples before each sample from the n-th on: oldest sample first, columns side by side."""
     windows = np.lib.stride_tricks.sliding_window_view(x, n, axis=0)[:-1]
     return np.swapaxes(windows, 1, 2).reshape(len(x) - n, -1)

@@ -1,4 +1,4 @@
-"""Linear state spaces: from subspaces, and fitted to free runs."""
+"""Linear state-space models: by a subspace method, and fitted to free runs."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -24,20 +24,20 @@ from rotflex_jax.recording.recording import common_signals
 
 @dataclasses.dataclass(frozen=True)
 class Subspace:
-    """A linear state-space model by a subspace method that is right in closed loop too.
+    """A linear state-space model by a subspace method that is consistent in closed loop too.
 
-    Order and length of the past are those with the best free run over the last part of the training
-    recordings. Not for coarse sensors at a high sampling rate alone: the regression minimises the
-    error of the next sample, and `LinearStateSpace` goes on from here to the free run. Signals that all
-    recordings have are further inputs.
+    Order and length of the past are chosen by the best free run over the last part of the training
+    recordings. Not enough for coarse sensors at a high sampling rate: the regression minimises the error of
+    the next sample. `LinearStateSpace` starts from its result and fits free runs. Signals that all recordings
+    have are further inputs.
 
     Source: A. Chiuso, The role of vector autoregressive modeling in predictor-based subspace
     identification, Automatica 43, 2007 (PBSIDopt).
 
     Attributes:
         orders: Numbers of states to choose from.
-        pasts: Samples of the past to choose from.
-        share: Share of each training recording to learn from; the rest decides.
+        pasts: Numbers of past samples to choose from.
+        share: Share of each training recording to learn from; the rest is for validation.
     """
 
     name: str = "subspace"
@@ -48,14 +48,14 @@ class Subspace:
     share: float = 0.7
 
     def fit(self, model: Model, train: Sequence[Recording], say: Progress) -> Fitted:
-        """Takes no notice of the model."""
+        """Choose order and past and fit the system; `model` is ignored."""
         found, past = chosen_system(train, self.orders, self.pasts, self.share, say)
         note = f"order {found.order}, past of {past} samples"
         return Fitted(found, free_numbers(found), note, found.predict)
 
 
 def free_numbers(system: LinearSystem) -> int:
-    """Numbers of the behaviour from inputs to outputs, offsets included, whatever the coordinates."""
+    """Number of parameters of the input-output behaviour with offsets, independent of the coordinates."""
     C, columns = system.D.shape
     return system.order * (C + columns - 1) + C * columns
 
@@ -63,7 +63,7 @@ def free_numbers(system: LinearSystem) -> int:
 def chosen_system(
     train: Sequence[Recording], orders: Sequence[int], pasts: Sequence[int], share: float, say: Progress
 ) -> tuple[LinearSystem, int]:
-    """The system whose order and past are best in free run within the training recordings, and its past."""
+    """The system with the order and past that give the best free runs over the validation parts; its past."""
     require_one_sampling_period(train, "a sampled system")
     first, last = split_for_validation(train, share)
     best, least = (orders[0], pasts[0]), np.inf
@@ -86,13 +86,13 @@ def subspace(recordings: Sequence[Recording], past: int, orders: Sequence[int]) 
 
     with the m inputs u: the input, and the signals that all recordings have.
 
-    The M_i of a long regression, stacked as an observability matrix times the past, have the states as
-    their strongest right singular vectors; with these the system is a linear regression.
+    The M_i follow from a long regression. They are stacked as an observability matrix times the past; its
+    strongest right singular vectors give the states. With the states, the system is a linear regression.
 
     Args:
-        recordings: All with the same sampling period.
-        past: Samples that the regression looks back.
-        orders: Numbers of states; those beyond what the data carry are left out.
+        recordings: Recordings with the same sampling period.
+        past: Number of past samples in the regression.
+        orders: Numbers of states; orders that the data do not support are left out.
     """
     signals = common_signals(recordings)
     m = 1 + len(signals)
@@ -108,11 +108,11 @@ def subspace(recordings: Sequence[Recording], past: int, orders: Sequence[int]) 
         ends.append(len(z) - past)
     Ys = np.vstack(Y)
     C, P = Ys.shape[1], Z[0].shape[1]
-    # All that follows needs only the triangular factor of the rows, which is small.
+    # The following steps need only the triangular factor of the rows, which is small.
     R = factor(np.hstack([np.vstack(Z), np.vstack(U), Ys]))
     known = P + m + 1
     M = np.linalg.lstsq(R[:, :known], R[:, known:], rcond=1e-10)[0][:P].T.reshape(C, past, m + C)
-    # Rows of block i predict i samples ahead from what is known now: the newest i lags have left.
+    # Rows of block i predict i samples ahead from the present past: the newest i lags are not known.
     stacked = np.zeros((past, C, past, m + C))
     for i in range(past):
         stacked[i, :, : past - i] = M[:, i:]
@@ -136,7 +136,7 @@ def _system(
     Ts: float,
     signals: tuple[str, ...],
 ) -> LinearSystem:
-    """The system with given states, by two regressions; in the units of the data."""
+    """The system with given states, by two regressions, in the units of the data."""
     n, m = X[0].shape[1], 1 + len(signals)
     x, y, u = np.vstack(X), np.vstack(Y), np.vstack(U)
     CD = _regression(np.hstack([x, u]), y)
@@ -149,7 +149,7 @@ def _system(
     sy = size[m:]
 
     def of_inputs(w: np.ndarray) -> np.ndarray:
-        """Columns of inputs and constant, from those of inputs about their means and of size one."""
+        """Columns of inputs and constant, from columns for inputs that are centred and scaled to size one."""
         columns = w[:, :m] / size[:m]
         return np.column_stack([columns, w[:, m] - columns @ mean[:m]])
 
@@ -159,7 +159,7 @@ def _system(
 
 
 def _regression(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Matrix W with y = W x, row by row."""
+    """Matrix W with y = W x for every row, by least squares."""
     R = factor(np.hstack([x, y]))
     P = x.shape[1]
     return np.linalg.lstsq(R[:, :P], R[:, P:], rcond=None)[0].T
@@ -172,11 +172,11 @@ def _sizes(columns: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     return z.mean(axis=0), np.where(size > 0, size, 1.0)
 
 
-# A pole closer to one than this cannot be distinguished from an integrator by any recording.
+# No recording distinguishes a pole with less decay than this from an integrator.
 LEAST_DECAY = 1e-9
 # Largest step of the logarithms of decay and angle of a pole.
 LARGEST_POLE_STEP = 1.0
-# A step that changes the sum over channels of log mean e^2 by less is not taken.
+# Change of the sum over channels of log mean e^2 that is not worth a step.
 LOG_COST_TOLERANCE = 1e-6
 
 
@@ -186,14 +186,14 @@ class Modes:
 
         x_i+ = p_i x_i + u_i,  x_i[0] = xi_ir in recording r,    y_c = offset_c + sum over i of Re(g_ci x_i)
 
-    Each of the m inputs (the input, then the signals) drives modes of its own, of the same n poles: they come
-    first of the input, then of each signal, S = m n in all.
+    Each of the m inputs (the input, then the signals) drives its own modes, which have the same n poles. The
+    modes of the input come first, then those of each signal; there are S = m n modes.
 
     Attributes:
-        p: Poles of the modes, one of each pair.
-        g: Residues, real where the pole is.
-        offset: Of each channel.
-        xi: First states, real where the pole is.
+        p: Poles of the modes, one of each complex pair.
+        g: Residues, real for a real pole.
+        offset: Offset of each channel.
+        xi: First states, real for a real pole.
         signals: Names of the signals.
     """
 
@@ -205,14 +205,14 @@ class Modes:
 
     @classmethod
     def begun(cls, poles: Sequence[complex], recordings: Sequence[Recording]) -> "Modes":
-        """Residues and first states for given poles, by least squares one after the other."""
+        """Residues, then first states, for given poles, both by least squares."""
         signals = common_signals(recordings)
         p = np.tile(np.array(poles, complex), 1 + len(signals))
         S, R, C = len(p), len(recordings), recordings[0].y.shape[1]
         y = np.concatenate([r.y for r in recordings]).astype(float)
         empty = cls(p, np.zeros((C, S), complex), np.zeros(C), np.zeros((R, S), complex), signals)
         forced, free = empty._forced(recordings), empty._free(recordings)
-        of_poles = _pair(free[:, : len(poles)])  # those of the other inputs are the same
+        of_poles = _pair(free[:, : len(poles)])  # the free modes of the other inputs are the same
         columns = [_pair(forced), np.ones((len(y), 1)), _by_recording(of_poles, recordings)]
         W = _least_norm(np.hstack(columns), y)
         g = _complex(W[: 2 * S].T, p)
@@ -225,7 +225,7 @@ class Modes:
 
     @property
     def pole_count(self) -> int:
-        """How many poles there are, which the modes of all inputs share."""
+        """Number of poles, which the modes of all inputs share."""
         return len(self.p) // (1 + len(self.signals))
 
     def fitted(self, recordings: Sequence[Recording], max_steps: int) -> "Modes":
@@ -237,7 +237,7 @@ class Modes:
                 return _log_cost(modes._errors(recordings))
 
         def linearised(modes: Modes) -> NormalEquations:
-            # Errors in units of their own size have the gradient of the logarithm.
+            # The errors divided by their own size give the gradient of the logarithm.
             e = modes._errors(recordings)
             size = np.sqrt(np.mean(e**2, axis=0)) + 1e-300
             J = -modes._slopes(recordings) / size[:, None]
@@ -252,7 +252,7 @@ class Modes:
         ).x
 
     def system(self, Ts: float) -> LinearSystem:
-        """The same as a state space with real numbers."""
+        """The modes as a state-space model with real numbers."""
         real = np.imag(self.p) == 0
         blocks = [
             np.array([[p.real]]) if r else np.array([[p.real, -p.imag], [p.imag, p.real]])
@@ -295,7 +295,7 @@ class Modes:
         return y - self.offset - np.real(self._states(recordings) @ self.g.T)
 
     def _slopes(self, recordings: Sequence[Recording]) -> Float[np.ndarray, "N C P"]:
-        """Of the outputs by decay and angle of the poles, residues, offsets, first states."""
+        """Derivatives of the outputs by decay and angle of the poles, residues, offsets, first states."""
         x, free = self._states(recordings), self._free(recordings)
         ends = np.cumsum([r.N for r in recordings])[:-1]
         by_pole = np.vstack([_filtered(self.p, part) for part in np.split(x, ends)])
@@ -353,12 +353,12 @@ def _block_diagonal(*blocks: np.ndarray) -> np.ndarray:
 
 
 def _by_recording(x: np.ndarray, recordings: Sequence[Recording]) -> np.ndarray:
-    """Columns of their own for each recording."""
+    """The rows of each recording in separate columns."""
     return _block_diagonal(*np.split(x, np.cumsum([r.N for r in recordings])[:-1]))
 
 
 def _least_norm(phi: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Least squares by way of the squares, columns of one size; the search goes on from here."""
+    """Least squares from normal equations with scaled columns; accurate enough as the start of a fit."""
     size = np.maximum(np.linalg.norm(phi, axis=0), 1e-300)
     phi = phi / size
     H = phi.T @ phi
@@ -370,24 +370,24 @@ def _log_cost(e: np.ndarray) -> float:
     return cost if np.isfinite(cost) else np.inf
 
 
-# Samples of each recording that the gain of the predictor is chosen on.
+# Number of samples of each recording on which the gain of the predictor is chosen.
 GAIN_SAMPLES = 2000
 
 
 @dataclasses.dataclass(frozen=True)
 class LinearStateSpace:
-    """A linear state space whose free run is fitted, begun at the poles of a subspace estimate.
+    """A linear state-space model that is fitted to free runs, started at the poles of a subspace estimate.
 
-    The best that a linear model with so many states can do in free run, whatever its physics. Not
-    where friction sticks for long: the poles then are a mean of two regimes. Signals that all recordings have
-    are further inputs, each with modes of its own of the same poles.
+    It is the best that a linear model with this number of states can do in free run, whatever the physics.
+    Not for friction that sticks for long: the poles are then a mean of two regimes. Signals that all
+    recordings have are further inputs, each with its own modes at the same poles.
 
     Source: L. Ljung, System Identification, 2nd ed., 1999, section 7.3 (output error).
 
     Attributes:
         orders: Numbers of states to choose from, by the free run over the last part.
-        pasts: Samples of the past that the subspace estimate may use.
-        share: Share of each training recording to learn from; the rest decides.
+        pasts: Numbers of past samples that the subspace estimate may use.
+        share: Share of each training recording to learn from; the rest is for validation.
     """
 
     name: str = "state_space"
@@ -398,7 +398,7 @@ class LinearStateSpace:
     share: float = 0.7
 
     def fit(self, model: Model, train: Sequence[Recording], say: Progress) -> Fitted:
-        """Takes no notice of the model."""
+        """Choose the order and fit the system; `model` is ignored."""
         require_one_sampling_period(train, "a sampled system")
         first, last = split_for_validation(train, self.share)
         begun: dict[int, tuple[float, LinearSystem]] = {}
@@ -416,7 +416,7 @@ class LinearStateSpace:
             raise RuntimeError("no subspace estimate could be made, the recordings are too short")
         best = min(fitted, key=lambda n: fitted[n][0])
         final = with_gain(refined(fitted[best][1], train), train)
-        # Poles are shared by the inputs.
+        # The inputs share the poles.
         C, columns = final.D.shape
         count = best * (C * (columns - 1) + 1) + C * columns
         return Fitted(final, count, f"order {best}", final.predict)
@@ -427,19 +427,19 @@ def refined(system: LinearSystem, recordings: Sequence[Recording], max_steps: in
 
         minimise  sum over channels of N log sum (y_c - y_hat_c)^2
 
-    over poles, residues, offsets and first states. A mode of one input is `x+ = p x + u`, whose
-    derivative by its pole is the same filter once more, so that a step costs a few filters.
+    over poles, residues, offsets and first states. A mode of one input is `x+ = p x + u`. Its derivative with
+    respect to the pole is the same filter applied once more, so a step costs only a few filters.
 
     Args:
-        system: Its poles are the start.
-        recordings: All with its sampling period.
-        max_steps: Most runs that are tried.
+        system: System whose poles are the start.
+        recordings: Recordings with its sampling period.
+        max_steps: Largest number of steps that are tried.
     """
     return Modes.begun(_distinct(system.poles), recordings).fitted(recordings, max_steps).system(system.Ts)
 
 
 def with_gain(system: LinearSystem, recordings: Sequence[Recording]) -> LinearSystem:
-    """The system with the gain of a Kalman filter for a disturbed input, the best one step ahead."""
+    """The system with the gain of a Kalman filter for a disturbed input that predicts best one step ahead."""
     recordings = [r.slice(0, min(r.N, GAIN_SAMPLES)) for r in recordings]
     y = [np.diff(r.y.astype(float), 2, axis=0) for r in recordings]
     noise = np.diag(np.maximum(np.concatenate(y).var(axis=0) / 6, 1e-300))  # white noise, differenced twice
@@ -462,7 +462,7 @@ def with_gain(system: LinearSystem, recordings: Sequence[Recording]) -> LinearSy
 
 
 def _distinct(poles: np.ndarray) -> list[complex]:
-    """One pole of each mode, inside of the unit circle and no two alike."""
+    """One pole of each mode, moved inside the unit circle and apart from equal poles."""
     kept: list[complex] = []
     for p in sorted(poles.tolist(), key=lambda p: (abs(p), p.imag)):
         p = complex(p) if abs(p.imag) > 1e-9 else complex(p.real)

@@ -1,4 +1,4 @@
-"""What a method of the comparison is, and its free runs over recordings it has not learned from."""
+"""Interface of the methods of the comparison, and their free runs over recordings that they have not seen."""
 
 import abc
 import dataclasses
@@ -24,7 +24,7 @@ Progress = Callable[[str], None]
 
 @runtime_checkable
 class Simulator(Protocol):
-    """What can simulate a recording."""
+    """A model that can simulate a recording."""
 
     @abc.abstractmethod
     def simulate(self, recording: Recording) -> Float[np.ndarray, "N C"]:
@@ -34,14 +34,14 @@ class Simulator(Protocol):
 
 @dataclasses.dataclass(frozen=True)
 class Fitted:
-    """What a method learned from recordings.
+    """The model that a method has learned from recordings.
 
     Attributes:
-        simulator: Simulates other recordings; a `Model`, or an object of the method's own.
+        simulator: Simulates other recordings; a `Model`, or any object with `simulate`.
         parameters: Number of fitted parameters.
-        note: What a reader of the table must know, as a phrase; "" for nothing.
-        predict: Outputs one step ahead, each from the input and the outputs before it; None
-            for a method that has no predictor.
+        note: Phrase with information for the reader of the table; "" for none.
+        predict: Function for one-step-ahead predictions, each from the input and the outputs before it; None
+            for a method without a predictor.
     """
 
     simulator: Simulator
@@ -55,8 +55,8 @@ class Method(Protocol):
     """One way to learn a model from recordings.
 
     Attributes:
-        name: Short, for tables and the command line.
-        title: What it is, as a phrase.
+        name: Short name, for tables and the command line.
+        title: Description as a phrase.
     """
 
     @property
@@ -68,15 +68,15 @@ class Method(Protocol):
 
     @abc.abstractmethod
     def fit(self, model: Model, train: Sequence[Recording], say: Progress) -> Fitted:
-        """Learn from recordings that have exactly the model's channels, in its order.
+        """Learn a model from recordings that have exactly the channels of `model`, in its order.
 
         Args:
-            model: The user's physics; a black box ignores it.
+            model: Physical model of the user; a black-box method ignores it.
             train: Recordings to learn from.
             say: Called with a short phrase now and then.
 
         Returns:
-            What was learned. Whatever is raised becomes a row that says so.
+            The learned model. If the method raises an error, its row states the error.
         """
         ...
 
@@ -95,7 +95,7 @@ def register(method: Method) -> Method:
         The same object.
 
     Raises:
-        InputError: It lacks one of these, or another method has the name.
+        InputError: The method lacks one of these, or another method has the same name.
     """
     _check(method)
     if METHODS.get(method.name, method) != method:
@@ -107,7 +107,7 @@ def register(method: Method) -> Method:
 
 
 def selected_methods(methods: Iterable[str | Method] | None) -> tuple[Method, ...]:
-    """Methods given by name or as objects; all registered ones for None."""
+    """Methods given by name or as objects; all registered methods for None."""
     if methods is None:
         return tuple(METHODS.values())
     if not isinstance(methods, str | Method | Iterable):
@@ -148,7 +148,7 @@ def _check(method: Any) -> None:
         )
 
 
-# A run that leaves the range of the measurements so many times over has diverged.
+# A run has diverged when its distance from the start exceeds this many ranges of the measurements.
 DIVERGENCE_FACTOR = 100.0
 
 
@@ -157,8 +157,8 @@ def hide_outputs(recording: Recording, seconds: float | None = None) -> Recordin
 
     Args:
         recording: The recording to simulate.
-        seconds: Length of the windows [s], of each of which a model may use the first `n_init` samples; if
-            None, of the recording alone.
+        seconds: Length of the windows [s]; a model may use the first `n_init` samples of each window. If
+            None, it may use only those of the recording.
     """
     k = np.arange(recording.N)
     hidden = k >= recording.n_init if seconds is None else metrics.counted(recording, seconds)
@@ -184,12 +184,12 @@ def _with_recording_shape(run: np.ndarray, recording: Recording) -> np.ndarray:
 def windowed_runs(
     simulator: Simulator, recordings: Sequence[Recording], seconds: float
 ) -> tuple[Float[np.ndarray, "_ C"], ...]:
-    """Free runs over each recording that start again every few seconds, as in a search.
+    """Free runs over the windows of each recording, as in a search.
 
-    A simulator that has `simulate_windows`, as every grey box, does it itself: the voltage drives it over the
-    whole recording, and a delay, a lag or a drift goes on from window to window. A black box (difference
+    A simulator with `simulate_windows`, such as every grey box, is driven by the voltage of the whole
+    recording, so that a delay, a lag or a drift continues from window to window. A black box (difference
     equation, state space, series) estimates its state, or the input before, from the first samples of a
-    recording: it runs over each window as over a recording of its own.
+    recording. It therefore runs over each window as over a separate recording.
 
     Args:
         simulator: It uses the input and the first `n_init` samples of each window.
@@ -211,12 +211,12 @@ def windowed_runs(
 def one_step_predictions(
     predict: Callable[[Recording], Float[np.ndarray, "_ C"]], recordings: Sequence[Recording]
 ) -> tuple[Float[np.ndarray, "_ C"], ...]:
-    """Predictions one step ahead; they use every sample before the one predicted."""
+    """Predictions one step ahead; each uses every sample before the predicted one."""
     return tuple(np.asarray(predict(recording), float) for recording in recordings)
 
 
 def simulation_time(simulator: Simulator, recordings: Sequence[Recording]) -> float:
-    """Time of the free runs [s]; run them once before, so that no compilation is counted."""
+    """Time of the free runs [s]; run them once before, so that compilation is not counted."""
     start = time.perf_counter()
     free_runs(simulator, recordings)
     return time.perf_counter() - start
@@ -225,7 +225,7 @@ def simulation_time(simulator: Simulator, recordings: Sequence[Recording]) -> fl
 def divergence_reason(
     runs: Sequence[Float[np.ndarray, "_ C"]], recordings: Sequence[Recording], ranges: Float[np.ndarray, " C"]
 ) -> str:
-    """When the first run diverged, as a sentence; "" where none did.
+    """Sentence on when the first run diverged; "" if no run diverged.
 
     Args:
         runs: Free runs.
@@ -235,7 +235,7 @@ def divergence_reason(
     limit = np.where(ranges > 0, DIVERGENCE_FACTOR * ranges, np.inf)
     for y_hat, recording in zip(runs, recordings, strict=True):
         start = recording.y[: recording.n_init].mean(axis=0)
-        # Written so that NaN counts as outside.
+        # In this form NaN counts as outside.
         outside = ~(np.abs(y_hat - start) <= limit).all(axis=1) | ~np.isfinite(y_hat).all(axis=1)
         if outside.any():
             seconds = float(np.argmax(outside)) * recording.Ts
@@ -247,7 +247,7 @@ def divergence_reason(
 def error_metrics(
     recordings: Sequence[Recording], runs: Sequence[Float[np.ndarray, "_ C"]]
 ) -> dict[str, dict[str, float]]:
-    """Metric -> channel -> value, over all recordings together, after the samples of `n_init`."""
+    """Metric -> channel -> value, over all recordings together, without the first `n_init` samples."""
     y = np.concatenate([r.y[r.n_init :] for r in recordings]).astype(float)
     y_hat = np.concatenate([run[r.n_init :] for r, run in zip(recordings, runs, strict=True)])
     formulas = {
@@ -273,17 +273,17 @@ def windowed_errors(
     return dict(zip(recordings[0].channels, rms.tolist(), strict=True))
 
 
-# Stretches of time that errors are reported for, and free runs that they are averaged over, at most.
+# Largest number of intervals of time for which errors are reported, and of free runs that are averaged.
 HORIZON_POINTS, HORIZON_RUNS = 16, 12
 
 
 @dataclasses.dataclass(frozen=True)
 class Horizon:
-    """Root mean square error of free runs by the time since the last measured sample that they use.
+    """Root mean square error of free runs as a function of the time since the last measured sample they use.
 
     Attributes:
-        seconds: End of each stretch of time [s].
-        rmse: Channel -> error within each stretch [unit].
+        seconds: End of each interval of time [s].
+        rmse: Channel -> error within each interval [unit].
         runs: Number of runs.
     """
 
@@ -309,9 +309,9 @@ def horizon_segments(recordings: Sequence[Recording], seconds: float) -> list[Re
 
 
 def errors_by_horizon(simulator: Simulator, recordings: Sequence[Recording], seconds: float) -> Horizon:
-    """Error against the horizon, in stretches of time that grow with it.
+    """Error as a function of the horizon, in intervals that grow with it.
 
-    The voltage drives a grey box over the whole recording, as in windows (`windowed_runs`).
+    A grey box is driven by the voltage of the whole recording, as in windows (`windowed_runs`).
 
     Args:
         simulator: The model to evaluate.
@@ -339,16 +339,16 @@ def errors_by_horizon(simulator: Simulator, recordings: Sequence[Recording], sec
 
 
 def split_for_validation(train: Sequence[Recording], share: float) -> tuple[list[Recording], list[Recording]]:
-    """First part of each recording, to fit, and last part, for validation."""
+    """First part of each recording, for the fit, and last part, for validation."""
     parts = [recording.split(share) for recording in train]
     return [a for a, _ in parts], [b for _, b in parts]
 
 
 def require_one_sampling_period(recordings: Sequence[Recording], what: str) -> None:
-    """Refuse recordings of different sampling periods, for which no single sampled model holds.
+    """Refuse recordings with different sampling periods, for which no single sampled model holds.
 
     Raises:
-        InputError: Their sampling periods differ by more than rounding.
+        InputError: The sampling periods differ by more than rounding.
     """
     if not of_one_period(r.Ts for r in recordings):
         raise InputError(
@@ -357,11 +357,11 @@ def require_one_sampling_period(recordings: Sequence[Recording], what: str) -> N
 
 
 def validation_cost(simulator: Simulator, recordings: Sequence[Recording]) -> float:
-    """Mean over the channels of the log of the free-run error; infinite where a run diverges.
+    """Mean over the channels of the logarithm of the free-run error; infinite if a run diverges.
 
     Args:
         simulator: The model to evaluate.
-        recordings: Validation part of the training recordings; one run over each.
+        recordings: Validation parts of the training recordings; one run over each.
     """
     with np.errstate(all="ignore"):
         runs = free_runs(simulator, recordings)

@@ -1,4 +1,4 @@
-"""The page of a comparison and its figures: best runs of each family, errors, errors against the horizon."""
+"""The page of a comparison and its figures: ranking, best runs of each family, horizons, spectra."""
 
 import math
 from pathlib import Path
@@ -16,12 +16,12 @@ from rotflex_jax.text.markup import as_json, fill_template, write_files
 from rotflex_jax.text.numbers import multiple, plain_number, readable, together
 from rotflex_jax.text.plotting import FigureRegistry, blank, by_section, legend_above, plain_ticks, thinned
 
-# Longer recordings are shown in part [s], fast ones only so many times through their mean; the errors are
-# those of the whole.
+# Longest part of a recording that is shown [s], and largest number of swings in it; errors are always for the
+# whole recording.
 COMPARED_SECONDS, COMPARED_CROSSINGS = 10.0, 60
-# How many times below the least error the noise of the sensor still has its line in the ranks.
+# The sensor noise has a line in the ranking if the least error is less than this factor above it.
 NOISE_LINE_RANGE = 100.0
-# In this order by rank; dashes and markers distinguish the methods without colour.
+# Colours by rank; dashes and markers distinguish the methods without colour.
 COLOURS = (FINAL, BASELINE, *FURTHER)
 DASHES = ("-", (0, (6, 1.5)), (0, (3, 1.5)), (0, (6, 1.5, 1.2, 1.5)), (0, (1.2, 1.2)), (0, (9, 3)))
 MARKERS = "os^Dvx"
@@ -76,7 +76,7 @@ def ranks(comparison: Comparison) -> Figure:
         floor = 100 * comparison.noise_floor.get(channel, 0.0) / std
         if floor * NOISE_LINE_RANGE > min([*whole, *short], default=0.0):
             ax.axvline(floor, color=NOISE, lw=1.1, ls=(0, (4, 2)), label="sensor noise")
-        elif floor > 0:  # a line there would leave the errors a corner of the picture
+        elif floor > 0:  # with a line, the errors would be squeezed into a corner of the picture
             text = f"sensor noise {floor:.1g} %, off to the left"
             ax.text(0.01, 0.01, text, transform=ax.transAxes, color=NOISE, fontsize="small")
         ax.axvline(100, color=MEASURED, lw=0.9, ls=":", label="no better than the mean")
@@ -126,7 +126,7 @@ def overlays(comparison: Comparison) -> Figure:
             below.axhspan(-2 * floor, 2 * floor, color=FAINT, lw=0, label="± 2 σ of the sensor")
         if largest:
             _within(above, y, max(np.ptp(y), 1e-12))
-            # The worst run may leave the picture: else the better ones could not be distinguished.
+            # The worst run may leave the picture; otherwise the better ones could not be distinguished.
             half = 1.1 * max(np.sort(largest)[: max(2, len(largest) - 1)].max(), 4 * floor)
             below.set_ylim(-half, half)
         above.set_ylabel(f"{channel} [{read}]")
@@ -140,10 +140,10 @@ def overlays(comparison: Comparison) -> Figure:
 
 
 def drawn(recording: Recording) -> int:
-    """How many samples are drawn, so that single swings can be seen."""
+    """Number of samples that are drawn, so that single swings can be seen."""
     most = min(recording.N, round(COMPARED_SECONDS / recording.Ts))
     away = recording.y[:most, 0] - recording.y[:most, 0].mean()
-    # Only swings count: about the mean, noise crosses it at every sample.
+    # Only swings count: near the mean, noise crosses it at every sample.
     swings = np.flatnonzero(np.abs(away) > 0.5 * away.std())
     turns = swings[1:][np.diff(away[swings] > 0)]
     return (
@@ -166,7 +166,7 @@ def _within(ax: Axes, y: np.ndarray, margin: float) -> None:
     description="Error against horizon on logarithmic scales.",
 )
 def horizons(comparison: Comparison) -> Figure:
-    """Error of free runs against how far they have gone, of the best method of each family."""
+    """Error of free runs against the horizon, for the best method of each family."""
     by_channel, figure = comparison.units, blank(10.0, 3.6)
     axes = figure.subplots(1, len(by_channel), squeeze=False)[0]
     for ax, (channel, unit) in zip(axes, by_channel.items(), strict=True):
@@ -229,12 +229,12 @@ def spectra(comparison: Comparison) -> Figure:
     return figure
 
 
-# An error within this factor of the least of its column is marked.
+# An error within this factor of the least error of its column is marked.
 NEAR_BEST = 1.05
 
 
 def write(comparison: Comparison, folder: Path) -> Path:
-    """Write `comparison.html` and `comparison.json`; returns the path of the page."""
+    """Write `comparison.html` and `comparison.json`; return the path of the page."""
     files = {"comparison.json": as_json(comparison.to_dict()), "comparison.html": render(comparison)}
     write_files(folder, files)
     return folder / "comparison.html"
@@ -246,7 +246,7 @@ def render(comparison: Comparison) -> str:
 
 
 def content(comparison: Comparison) -> dict[str, Any]:
-    """What the template fills in; plain text that the template escapes."""
+    """Values for the template; plain text that the template escapes."""
     units = comparison.units
     good = [row for row in comparison.rows if row.status == "ok"]
     colours = {row.method: style[0] for row, style in line_styles(comparison)}

@@ -1,4 +1,4 @@
-"""Methods that start from the user's physics: as given, fitted, with more effects, with a learned torque."""
+"""Methods that start from the user's mechanism: as given, fitted, with added effects or a learned torque."""
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
@@ -19,14 +19,14 @@ from rotflex_jax.recording import Recording
 
 @dataclasses.dataclass(frozen=True)
 class Textbook:
-    """The mechanism as it was given, nothing fitted."""
+    """The mechanism as it was given; nothing is fitted."""
 
     name: str = "textbook"
     title: str = "the mechanism with its given parameters"
     family: str = "physics"
 
     def fit(self, model: Model, train: Sequence[Recording], say: Progress) -> Fitted:
-        """Ignores the recordings, but for the predictor's noise."""
+        """Return the model unchanged; only the noise of its predictor comes from the recordings."""
         return Fitted(model, parameters=0, predict=one_step_predictor(model, train))
 
 
@@ -39,7 +39,7 @@ class LinearPart:
     family: str = "physics"
 
     def fit(self, model: Model, train: Sequence[Recording], say: Progress) -> Fitted:
-        """Leave out every effect that is not linear, then fit as the grey box."""
+        """Leave out effects that are neither linear nor driven by a signal, then fit as the grey box."""
         mechanism = model.mechanism
         nonlinear = [e for e in mechanism.effects if not e.is_linear and not e.signal]
         for e in nonlinear:
@@ -51,14 +51,14 @@ class LinearPart:
 
 @dataclasses.dataclass(frozen=True)
 class GreyBox:
-    """The mechanism, its free parameters fitted to free runs."""
+    """The mechanism, with its free parameters fitted to free runs."""
 
     name: str = "grey_box"
     title: str = "the mechanism, fitted to free runs"
     family: str = "physics"
 
     def fit(self, model: Model, train: Sequence[Recording], say: Progress) -> Fitted:
-        """Fit the error that is compared."""
+        """Fit the free parameters to free runs, the error that is compared."""
         return fit_mechanism(model, train, say)
 
 
@@ -66,11 +66,12 @@ class GreyBox:
 class GreyBoxPredictor:
     """The mechanism, fitted to the predictions of a Kalman filter.
 
-    Missing physics biases the parameters less than in a free run, since the filter attributes a part
-    of the error to unknown torques; in return the error of free runs is not minimised.
+    Missing physics biases the parameters less than in a free run, because the filter attributes a part of the
+    error to unknown torques. In return the error of free runs is not minimised.
 
     Attributes:
-        share: Intensity of these torques, as a share of that of white noise as large as the motor's torque.
+        share: Intensity of these torques, as a share of the intensity of white noise as large as the torque
+            of the motor.
     """
 
     name: str = "grey_box_predictor"
@@ -79,7 +80,7 @@ class GreyBoxPredictor:
     share: float = MAX_PROCESS_NOISE_SHARE
 
     def fit(self, model: Model, train: Sequence[Recording], say: Progress) -> Fitted:
-        """Fit innovations instead of free runs."""
+        """Fit the free parameters to innovations instead of free runs."""
         return fit_mechanism(model, train, say, _process_noise(model, prepare(model, train), self.share))
 
 
@@ -87,8 +88,8 @@ class GreyBoxPredictor:
 class Discovered:
     """The mechanism with the effects that discovery adds, fitted like the grey box.
 
-    Effects are chosen within the training recordings, whose ends are the validation part; the test data
-    of the comparison are not used.
+    Effects are chosen within the training recordings, whose last parts are for validation. The test data of
+    the comparison are not used.
 
     Attributes:
         share: Share of each training recording that discovery learns from; the rest is for validation.
@@ -100,7 +101,7 @@ class Discovered:
     share: float = 0.7
 
     def fit(self, model: Model, train: Sequence[Recording], say: Progress) -> Fitted:
-        """Discover on parts of the training recordings, then fit to all of each."""
+        """Discover on parts of the training recordings, then fit to the whole of each."""
         result = discover(model, *split_for_validation(train, self.share), progress=say)
         found = ", ".join(effect_label(*pair) for pair in result.added)
         note = f"added {found}" if found else f"added nothing ({result.verdict.replace('_', ' ')})"
@@ -114,7 +115,7 @@ def fit_mechanism(
     process_noise: Mapping[str, float] | None = None,
     note: str = "",
 ) -> Fitted:
-    """A fit of the free parameters; one that diverged raises, an early stop and remarks are noted."""
+    """Fit the free parameters; raise if the fit diverged, and note an early stop and remarks."""
     fitted = fit(model, train, process_noise=process_noise, progress=say)
     if fitted.status.startswith("diverged"):
         raise RuntimeError(fitted.status)
@@ -124,14 +125,14 @@ def fit_mechanism(
 
 
 def _process_noise(model: Model, train: Dataset, share: float) -> dict[str, float]:
-    """Intensity of white torques along every coordinate, as a share of the motor's torque."""
+    """Intensity of white torques along every coordinate, from a share of the torque of the motor."""
     return process_noise_ports(model.mechanism, share * train.torque_scale**2 * float(train.data.Ts[0]))
 
 
 def one_step_predictor(
     model: Model, train: Sequence[Recording]
 ) -> Callable[[Recording], Float[np.ndarray, "N C"]]:
-    """One step ahead by the stationary Kalman filter with unknown torques as process noise."""
+    """One-step-ahead predictor: the stationary Kalman filter with unknown torques as process noise."""
     dataset = prepare(model, train)
     torques = _process_noise(model, dataset, MAX_PROCESS_NOISE_SHARE)
     return lambda recording: model.predict(recording, torques, dataset.noise)
@@ -139,11 +140,11 @@ def one_step_predictor(
 
 @dataclasses.dataclass(frozen=True)
 class LearnedTorqueMethod:
-    """The grey box with a learned torque at one port, a smooth map of position and speed there.
+    """The grey box with a learned torque at one port: a smooth map of position and speed of the port.
 
     Attributes:
-        at: Port; the first one of the mechanism if None.
-        share: Share of each training recording that the map is fitted to; the rest is for validation.
+        at: Port; the first port of the mechanism if None.
+        share: Share of each training recording to which the map is fitted; the rest is for validation.
     """
 
     name: str = "learned_torque"
@@ -153,7 +154,7 @@ class LearnedTorqueMethod:
     share: float = 0.7
 
     def fit(self, model: Model, train: Sequence[Recording], say: Progress) -> Fitted:
-        """Fit the mechanism first, then the map beside it."""
+        """Fit the mechanism first, then the map in addition to it."""
         fitted = fit_mechanism(model, train, say)
         grey_box = fitted.simulator
         assert isinstance(grey_box, Model)

@@ -41,30 +41,30 @@ def compare(
     window_seconds: float = 2.0,
     progress: Progress | None = None,
 ) -> Comparison:
-    """Every method on the same data, evaluated by its free run over test data.
+    """Compares methods on the same data by their free runs over test data.
 
-    All learn from the same training part and are evaluated on the same test part, of which they get the
-    input and the first `n_init` samples of the outputs: the rest is hidden before they simulate. A
-    method that fails or diverges is a row that says so. The error of predictions one step ahead is
-    reported where a method has a predictor, and never used to rank: the last sample alone predicts the
+    All methods learn from the same training part and are evaluated on the same test part. Of the test part
+    they receive the input and the first `n_init` samples of the outputs; the rest is hidden before they
+    simulate. If a method fails or diverges, its row states this. The error of one-step-ahead predictions is
+    reported if a method has a predictor, but never used for the ranking: the last sample alone predicts the
     next one well.
 
     Args:
-        recordings: One or several.
-        methods: Names of registered methods, or objects that are methods; all registered if None,
-            `rotflex_jax.compare.QUICK` are those without a long search.
-        mechanism: Physics of the methods that start from it; `joints.paper()` if None.
-        test: Test recordings; without them, the end of each recording.
-        fraction: Share of each recording to learn from, where `test` is not given [-]; 0.7 if None.
-        window_seconds: Length of the short free runs [s].
+        recordings: One or several recordings.
+        methods: Names of registered methods, or objects that are methods; all registered methods if None.
+            `rotflex_jax.compare.QUICK` has the methods without a long search.
+        mechanism: Physical model of the methods that start from one; `joints.paper()` if None.
+        test: Test recordings; if None, the end of each recording.
+        fraction: Share of each recording to learn from, if `test` is not given [-]; 0.7 if None.
+        window_seconds: Length of the windows of the short free runs [s].
         progress: Called with a line of text now and then.
 
     Returns:
         Comparison, best method first.
 
     Raises:
-        InputError: An unknown method, no recording, `test` together with `fraction`, or a recording
-            without the channels of the mechanism.
+        InputError: A method is unknown, there is no recording, `test` and `fraction` are both given, or a
+            recording lacks a channel of the mechanism.
     """
     start, say = time.perf_counter(), checks.progress(progress)
     chosen = selected_methods(methods)
@@ -100,7 +100,7 @@ def _row(
 ) -> Row:
     row = Row(method.name, method.title, family=getattr(method, "family", "other"))
     start = time.perf_counter()
-    # Whatever goes wrong in one method must not cost the others their rows.
+    # An error in one method must not cost the other methods their rows.
     try:
         fitted = method.fit(model, train, lambda text: say(f"{method.name}: {text}"))
         row = dataclasses.replace(
@@ -155,7 +155,7 @@ def _training_and_test(
 
 
 def _with_model_channels(recording: Recording, model: Model) -> Recording:
-    """The recording with the model's channels alone, in its order: the same for every method."""
+    """The recording with only the channels of the model, in its order: the same for every method."""
     wanted = model.mechanism.channels
     if recording.channels == wanted:
         return recording

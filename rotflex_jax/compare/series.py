@@ -1,4 +1,4 @@
-"""Volterra series of the input as methods: banks, regression on integrated regressors, free runs."""
+"""Methods with Volterra series of the input: banks, regression on integrated regressors, free runs."""
 
 import dataclasses
 import itertools
@@ -21,14 +21,14 @@ BankKind = Literal["delays", "laguerre", "kautz", "poles"]
 
 
 def candidate_banks(kind: BankKind, count: int, train: Sequence[Recording]) -> list[Bank]:
-    """Banks of a kind, to choose from.
+    """Banks of a kind to choose from.
 
     Args:
-        kind: `delays` are means over stretches, `laguerre` share one real pole, `kautz` one pair, `poles`
-            are those of a linear model that is identified first, all repeated until there are at least
-            `count`.
-        count: Columns of each; the least number for `poles`.
-        train: Training recordings, whose length bounds the memory.
+        kind: Kind of bank. `delays`: means of the input over successive intervals. `laguerre`: one real pole.
+            `kautz`: one pair of poles. `poles`: the poles of a linear model that is identified first, all
+            repeated until there are at least `count`.
+        count: Number of columns of each bank; the least number for `poles`.
+        train: Training recordings, whose length limits the memory.
     """
     longest = max(r.N for r in train)
     if kind == "delays":
@@ -47,7 +47,7 @@ def candidate_banks(kind: BankKind, count: int, train: Sequence[Recording]) -> l
 
 
 def _decaying_poles(train: Sequence[Recording], count: int) -> list[complex]:
-    """At least `count` poles of an identified linear model that decay within recordings, slow ones first."""
+    """At least `count` poles of an identified linear model that decay within a recording, slow ones first."""
     start = chosen_system(train, (4, 6), (16, 64), 0.7, lambda _: None)[0]
     slowest = np.exp(-20 / max(r.N for r in train))
     poles = [p for p in refined(start, train).poles.tolist() if 0.5 < abs(p) < slowest]
@@ -63,25 +63,25 @@ def _decaying_poles(train: Sequence[Recording], count: int) -> list[complex]:
     return found
 
 
-# Segments of constant unknown input before the recording, of growing length into the past.
+# Number of segments of constant unknown input before the recording, which are longer further in the past.
 PAST_SEGMENTS = 12
 LONGEST_PAST_SAMPLES = 4000
 
 
 @dataclasses.dataclass(frozen=True)
 class ChannelSeries:
-    """Weights in front of a basis of the input, for one output.
+    """A weighted sum of the regressors of a basis of the input, for one output.
 
         y[t] = w phi[t],  or where it integrates  y[t] = y[t-1] + Ts w phi[t]
 
     Attributes:
         basis: Volterra series on a bank.
-        weights: Of the regressors.
-        integrates: Whether the series is the rate of the output.
-        Ts: Sampling period it holds for [s].
-        noise: Error of the series over stretches as long as the first samples [output].
-        mean: Mean of the input, prior mean of the unknown past.
-        spread: Standard deviation of the input, that of the prior.
+        weights: Weights of the regressors.
+        integrates: Whether the series models the rate of the output.
+        Ts: Sampling period for which the series holds [s].
+        noise: Error of the series over intervals of `n_init` samples [unit of the output].
+        mean: Mean of the input; prior mean of the unknown past input.
+        spread: Standard deviation of the input; prior standard deviation of the unknown past input.
     """
 
     basis: Volterra
@@ -97,7 +97,7 @@ class ChannelSeries:
         reach, m = min(int(self.basis.bank.reach), LONGEST_PAST_SAMPLES), len(head)
         edges = np.unique(np.round(np.geomspace(1, reach, PAST_SEGMENTS)).astype(int))
         edges = np.concatenate([[0], edges])
-        # The bank is linear and time-invariant: a segment of input is one step less a later one.
+        # The bank is linear and time-invariant: a segment of input is a step less a later step.
         step = bank_outputs(self.basis.bank, np.ones(reach + m))
         until = [step[b : b + m] for b in edges]
         unknown = self.spread * np.stack([b - a for a, b in itertools.pairwise(until)])
@@ -114,7 +114,7 @@ class ChannelSeries:
         return self.Ts * np.cumsum(rate) if self.integrates else rate
 
     def _past(self, head: np.ndarray, known: np.ndarray, unknown: np.ndarray) -> Float[np.ndarray, " K"]:
-        """Most likely input before the first sample, in standard deviations about its mean."""
+        """Most likely input before the first sample, in standard deviations from its mean."""
 
         def missed(a: np.ndarray) -> np.ndarray:
             e = head - self._output(known + np.tensordot(a, unknown, axes=1))
@@ -126,7 +126,7 @@ class ChannelSeries:
         for _ in range(12):
             J = np.stack([(missed(a + d) - e) / 1e-4 for d in 1e-4 * np.eye(len(a))], axis=1)
             H, b, before = J.T @ J, J.T @ e, float(e @ e)
-            # A polynomial may overshoot: a shorter step then, or none.
+            # With a polynomial a step may overshoot: then a shorter step is taken, or none.
             for _ in range(5):
                 move = np.linalg.solve(H + damping * np.diag(np.diag(H)), -b)
                 new = missed(a + move)
@@ -141,7 +141,7 @@ class ChannelSeries:
 
 @dataclasses.dataclass(frozen=True)
 class SeriesModel:
-    """One series for each output, whichever way its weights were learned."""
+    """One series for each output, independent of how its weights were learned."""
 
     channels: tuple[ChannelSeries, ...]
 
@@ -153,7 +153,7 @@ class SeriesModel:
         return np.stack([c.simulate(u, recording.y[:m, i]) for i, c in enumerate(self.channels)], axis=1)
 
     def predict(self, recording: Recording) -> Float[np.ndarray, "N C"]:
-        """One step ahead: an output that integrates goes on from its last sample, others run free."""
+        """One-step-ahead prediction: a rate is added to the last sample; other outputs are free runs."""
         run, y = self.simulate(recording), recording.y.astype(float)
         for i, c in enumerate(self.channels):
             if c.integrates:
@@ -162,7 +162,7 @@ class SeriesModel:
 
     @property
     def parameters(self) -> int:
-        """Weights in all."""
+        """Number of weights that are not zero."""
         return sum(int(np.count_nonzero(c.weights)) for c in self.channels)
 
 
@@ -189,10 +189,10 @@ def monomials(basis: Volterra, z: Float[np.ndarray, "N M"]) -> Float[np.ndarray,
 
 
 def series_model(parts: Sequence[ChannelSeries]) -> SeriesModel:
-    """The series of all outputs.
+    """The series of all outputs as one model.
 
     Raises:
-        RuntimeError: Weights that are not finite.
+        RuntimeError: A weight is not finite.
     """
     if not all(np.isfinite(c.weights).all() for c in parts):
         raise RuntimeError("the weights are not finite")
@@ -204,9 +204,9 @@ class SeriesRegression:
     """Regressors and output of one recording.
 
     Attributes:
-        phi: Regressors, integrated where the output integrates.
+        phi: Regressors; integrated if the series models the rate of the output.
         y: Output.
-        skip: Samples at the start that do not count: the input before is unknown.
+        skip: Number of samples at the start that do not count, because the input before is unknown.
         integrates: Whether only changes of the output count, not its level.
     """
 
@@ -217,7 +217,7 @@ class SeriesRegression:
 
     @classmethod
     def of(cls, basis: Volterra, recording: Recording, channel: int, integrates: bool) -> "SeriesRegression":
-        """Rows of a recording."""
+        """The regression of a recording."""
         phi = monomials(basis, bank_outputs(basis.bank, recording.u.astype(float)))
         if integrates:
             phi = recording.Ts * np.cumsum(phi, axis=0)
@@ -225,24 +225,24 @@ class SeriesRegression:
         return cls(phi, recording.y[:, channel].astype(float), skip, integrates)
 
     def part(self, start: int, end: int) -> Float[np.ndarray, "M K"]:
-        """Rows `[phi, y]`, without their level where that does not count."""
+        """Rows `[phi, y]`; without their mean if the level does not count."""
         joined = np.column_stack([self.phi[start:end], self.y[start:end]])
         return joined - joined.mean(axis=0) if self.integrates else joined
 
     def error(self, w: Float[np.ndarray, " P"], start: int, head: int) -> Float[np.ndarray, " M"]:
-        """Error of weights in a free run that starts at `start` and uses `head` samples."""
+        """Error of the weights in a free run that starts at `start` and uses the first `head` samples."""
         e = self.y[start:] - self.phi[start:] @ w
         return (e - e[:head].mean() if self.integrates else e)[head:]
 
 
 @dataclasses.dataclass(frozen=True)
 class SelectedSeries:
-    """The selected basis for one output, with weights from all of the training data.
+    """The selected basis for one output, with weights from all training data.
 
     Attributes:
-        series: With weights of batch least squares.
-        cost: Log of the free-run error over the validation part, of weights from the first part.
-        penalty: Ridge on weights of regressors of size one, per sample.
+        series: Series with the weights of batch least squares.
+        cost: Logarithm of the free-run error over the validation part, with weights from the first part.
+        penalty: Ridge penalty on the weights of regressors of size one, per sample.
     """
 
     series: ChannelSeries
@@ -257,17 +257,17 @@ def select_series(
     share: float,
     penalties: Sequence[float] = (0.0,),
 ) -> SelectedSeries:
-    """The basis, output or rate, and ridge with the least free-run error over the validation part.
+    """The basis, series of output or rate, and ridge with the least free-run error over the validation part.
 
-    An angle that integrates has no finite memory: its own series would be arbitrarily wrong, that of
-    its rate is not. Either is fitted to the free run itself, by regression on integrated regressors.
+    An angle that integrates has no finite memory: a series of the angle would be arbitrarily wrong, but a
+    series of its rate is not. Both are fitted to the free run, by regression on integrated regressors.
 
     Args:
         bases: Candidates.
-        train: Recordings of one sampling period.
-        channel: Number of the output.
-        share: First part of each recording.
-        penalties: Ridges to choose from, on weights of regressors of size one, per sample.
+        train: Recordings with one sampling period.
+        channel: Index of the output.
+        share: Share of each recording in the first part.
+        penalties: Ridge penalties to choose from, on the weights of regressors of size one, per sample.
     """
     best: tuple[float, Volterra, bool, float] | None = None
     cuts = [round(share * r.N) for r in train]
@@ -295,7 +295,7 @@ def channel_series(
     channel: int,
     rows: Sequence[SeriesRegression] | None = None,
 ) -> ChannelSeries:
-    """The series with these weights and the size of its error."""
+    """The series with these weights, and with the size of its error."""
     rows = rows or [SeriesRegression.of(basis, r, channel, integrates) for r in train]
     short = []
     for x, r in zip(rows, train, strict=True):
@@ -312,13 +312,13 @@ def channel_series(
 
 
 def ridge_weights(parts: Sequence[Float[np.ndarray, "M K"]], penalty: float) -> Float[np.ndarray, " P"]:
-    """Least squares with a ridge on the weights of regressors of size one, per sample."""
+    """Weights by least squares, with a ridge penalty on the weights of regressors of size one, per sample."""
     size, count = _regressor_scales(parts), sum(map(len, parts))
     return solve(factor(np.concatenate([p / size for p in parts])), penalty * count).w / size[:-1]
 
 
 def _ridge_path(parts: Sequence[Float[np.ndarray, "M K"]], penalties: Sequence[float]) -> list[np.ndarray]:
-    """The same for several ridges from the normal equations: accurate enough for a choice."""
+    """Weights for several ridge penalties, from the normal equations: accurate enough for a choice."""
     size = _regressor_scales(parts)
     H = np.sum([p.T @ p for p in (p / size for p in parts)], axis=0) / sum(map(len, parts))
     values, V = np.linalg.eigh(H[:-1, :-1])
@@ -341,19 +341,19 @@ RIDGES = (1e-9, 1e-7, 1e-5, 1e-3, 1e-1)
 class BatchSeries:
     """A Volterra series of the input by batch least squares, fitted to free runs.
 
-    The time scale of the bank, and whether the series is an output or its rate, are those with the
-    best free run over the last part of the training recordings; for each output its own. Not where
-    friction sticks: no polynomial of the past input keeps a machine at rest.
+    The time scale of the bank, and whether the series models an output or its rate, are chosen for each
+    output by the best free run over the last part of the training recordings. Not for friction that sticks:
+    no polynomial of the past input keeps a machine at rest.
 
     Source: Schetzen 1980; orthonormal banks Wahlberg 1991, IEEE Trans. Autom. Control 36.
 
     Attributes:
-        name: Short.
-        title: In words.
+        name: Short name.
+        title: Description in words.
         bank: Kind of the bank.
-        order: Of the Volterra series.
-        count: Columns of the bank.
-        penalties: Ridges to choose from, on weights of regressors of size one, per sample.
+        order: Order of the Volterra series.
+        count: Number of columns of the bank.
+        penalties: Ridge penalties to choose from, on the weights of regressors of size one, per sample.
         share: Share of each training recording to learn from; the rest is for validation.
     """
 
@@ -367,7 +367,7 @@ class BatchSeries:
     family: str = "series"
 
     def fit(self, model: Model, train: Sequence[Recording], say: Progress) -> Fitted:
-        """Ignores the model."""
+        """Choose a series for each output and fit it; `model` is ignored."""
         require_one_sampling_period(train, "a series")
         candidates = [Volterra(b, self.order) for b in candidate_banks(self.bank, self.count, train)]
         choices = []

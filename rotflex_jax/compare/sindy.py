@@ -1,4 +1,4 @@
-"""Sparse identification of nonlinear dynamics with an input: equations with few terms, by pysindy."""
+"""Sparse identification of nonlinear dynamics (SINDy) with an input: equations with few terms, by pysindy."""
 
 import dataclasses
 import itertools
@@ -17,14 +17,14 @@ from rotflex_jax.models.model import Model
 from rotflex_jax.recording import Recording
 
 Smoothing = tuple[str, int | float]
-"""`savgol` with a window in samples, or `spline` with the cutoff of its smoothing in samples."""
+"""`savgol` with a window in samples, or `spline` with the cutoff period of its smoothing in samples."""
 
 
 def smoothed_derivatives(recording: Recording, smoothing: Smoothing) -> Float[np.ndarray, "N K"]:
-    """Outputs, speeds and accelerations after smoothing, C columns each, one block after the other.
+    """Outputs, speeds and accelerations after smoothing, in three blocks of C columns.
 
     Raises:
-        InputError: A kind of smoothing that does not exist.
+        InputError: The kind of smoothing does not exist.
     """
     y, (kind, width) = recording.y.astype(float), smoothing
     if kind == "savgol":
@@ -52,15 +52,16 @@ def smoothed_derivatives(recording: Recording, smoothing: Smoothing) -> Float[np
 def smoothed_input(
     recording: Recording, smoothing: Smoothing, order: int, held: bool = True
 ) -> Float[np.ndarray, " N"]:
-    """The input as it appears in smoothed derivatives of that order.
+    """The input as it appears in smoothed derivatives of order `order`.
 
-    A filter that differentiates is a smoothing of the true derivative, by its own kernel integrated as
-    many times. An acceleration so smoothed belongs to an input smoothed by the same kernel: a regression on
-    the input itself is biased, the more the faster the input changes.
+    A differentiating filter smooths the true derivative; the kernel of this smoothing is the kernel of the
+    filter, integrated `order` times. An acceleration that is smoothed like this belongs to an input that is
+    smoothed by the same kernel. A regression on the input itself is biased, and the more so, the faster the
+    input changes.
     """
     u = recording.u.astype(float)
-    # A second difference lies between the input held before it and the one held after it, a first one on
-    # the input that follows.
+    # A second difference belongs to the mean of the input held before it and the input held after it, a
+    # first difference to the input held after it.
     between = u if not held else (u + np.concatenate([u[:1], u[:-1]])) / 2
     after = u if held else (u + np.concatenate([u[1:], u[-1:]])) / 2
     kind, width = smoothing
@@ -68,7 +69,7 @@ def smoothed_input(
         return _spline(between, width)(np.arange(len(u), dtype=float))
     window = _window_length(width, len(u))
     once = -np.cumsum(scipy.signal.savgol_coeffs(window, min(3, window - 1), deriv=order, use="dot"))
-    # Summed by parts: of first differences once, of second ones twice and a sample later.
+    # Summation by parts: once for first differences; twice, and one sample later, for second differences.
     kernel, x = (once, after) if order == 1 else (np.concatenate([[0.0], -np.cumsum(once)[:-1]]), between)
     return np.correlate(np.pad(x, window // 2, mode="edge"), kernel, mode="valid")
 
@@ -78,40 +79,41 @@ def _window_length(width: float, N: int) -> int:
 
 
 def _spline(x: np.ndarray, width: float) -> "scipy.interpolate.BSpline":
-    """The smoother of a random walk of the acceleration's integral: its cutoff is the width."""
+    """Smoothing spline whose cutoff period is `width` samples."""
     t = np.arange(len(x), dtype=float)
     return scipy.interpolate.make_smoothing_spline(t, x, lam=(width / (2 * np.pi)) ** 4)
 
 
 Span = tuple[float, float]
-"""From which share of a recording to which."""
+"""Beginning and end of a part of a recording, as shares of its length."""
 
 
 @dataclasses.dataclass(frozen=True)
 class SINDy:
     """Equations of motion with few terms, by sequentially thresholded least squares.
 
-    States are the outputs and their speeds, from smoothing; that a speed is the rate of its output is
-    not fitted. The smoothing, the threshold, and whether the equations give accelerations or rates are
-    those with the best free runs over a validation part of the training recordings, the last and then the
-    first. The input is smoothed as the accelerations are. Not for coarse sensors at a
-    high sampling rate, where the result depends on the smoothing: the note says how much.
+    The states are the outputs and their speeds, from smoothing. The relation of an output to its speed is
+    given and not fitted. The smoothing, the threshold, the powers, and whether the equations give
+    accelerations or rates are chosen by the best free runs over validation parts of the training recordings,
+    at their end and at their beginning. The input is smoothed like the accelerations. Not for coarse sensors
+    at a high sampling rate, where the result depends on the smoothing; the note states how much.
 
     Source: Brunton, Proctor and Kutz 2016, PNAS 113; ensembles Fasel et al. 2022, Proc. R. Soc. A 478;
     weak form Messenger and Bortz 2021, Multiscale Model. Simul. 19.
 
     Attributes:
-        name: Short.
-        title: In words.
-        variant: `plain`, `ensemble` (median of fits to bags of samples) or `weak` (without
+        name: Short name.
+        title: Description in words.
+        variant: `plain`, `ensemble` (median of fits to random bags of samples) or `weak` (without
             accelerations).
         smoothings: Kinds of smoothing to choose from.
-        thresholds: To choose from, for terms and rates of size one.
-        orders: To choose from: 2 for accelerations, 1 for rates of the outputs.
-        degrees: To choose from: 1 without powers in the library, 3 with them.
-        share: First part of each recording; the rest is for validation.
-        seconds: Length of the validation runs [s]; free runs over all of a recording must not diverge.
-        bags: Fits of an ensemble.
+        thresholds: Thresholds to choose from, for terms and rates of size one.
+        orders: Orders to choose from: 2 for accelerations, 1 for rates of the outputs.
+        degrees: Degrees to choose from: 1 without powers in the library, 3 with powers.
+        share: Share of each recording to fit to; the rest is for validation.
+        seconds: Length of the validation runs [s]; in addition, free runs over a whole recording must not
+            diverge.
+        bags: Number of fits in an ensemble.
         free_runs: Whether the weights are refined for free runs, which is not part of SINDy.
     """
 
@@ -134,12 +136,12 @@ class SINDy:
     family: str = "sindy"
 
     def fit(self, model: Model, train: Sequence[Recording], say: Progress) -> Fitted:
-        """Ignores the model, but for the shape of its input between samples."""
+        """Choose and fit the equations; of `model` only the intersample behaviour of the input is used."""
         ps = _pysindy()
         held = getattr(getattr(model, "solver", None), "between", "held") != "smooth"
         require_one_sampling_period(train, "the smoothing")
         tried: list[tuple[float, tuple[int, int], Smoothing, float]] = []
-        # Fitted to the first part and validated on the rest, then the other way round.
+        # Fitted to the first part and validated on the rest; then fitted to the last part.
         folds: tuple[tuple[Span, Span], ...] = (
             ((0.0, self.share), (self.share, 1.0)),
             ((1 - self.share, 1.0), (0.0, 1 - self.share)),
@@ -183,7 +185,7 @@ class SINDy:
         states: list[np.ndarray],
         say: Progress,
     ) -> tuple[np.ndarray, str]:
-        """Weights refined for free runs, if refinement of those of the first part helps over the rest."""
+        """Weights refined for free runs, if refining the weights of the first part helps over the rest."""
         last = self._pieces(train, states, (self.share, 1.0))
         part = refined(terms, first, self._pieces(train, states, (0.0, self.share)), train[0].Ts)
         before, after = costs(terms, np.stack([first, part]), last, train, states)
@@ -224,7 +226,7 @@ class SINDy:
     def _weights(
         self, ps: Any, rows: tuple[np.ndarray, np.ndarray], threshold: float
     ) -> Float[np.ndarray, "P C"]:
-        """Weights by an optimiser of pysindy, for terms and rates of size one."""
+        """Weights by an optimiser of pysindy, applied to terms and rates of size one."""
         phi, rate = rows
         size, out = np.sqrt(np.mean(phi**2, axis=0)), np.sqrt(np.mean(rate**2, axis=0))
         size, out = np.where(size > 0, size, 1.0), np.where(out > 0, out, 1.0)
@@ -239,7 +241,7 @@ class SINDy:
         return W / size[:, None] * out
 
     def _pieces(self, train: Sequence[Recording], states: list[np.ndarray], span: Span) -> list[Piece]:
-        """Segments of one length for free runs, from a part of each recording."""
+        """Segments of equal length for free runs, from a part of each recording."""
         bounds = [[round(s * r.N) for s in span] for r in train]
         length = min(min(j - i for i, j in bounds), max(8, round(self.seconds / train[0].Ts)))
         return [
@@ -262,7 +264,7 @@ def _state_columns(x: np.ndarray, terms: Terms) -> np.ndarray:
 
 def _sparse_weights(ps: Any, phi: np.ndarray, rate: np.ndarray, threshold: float) -> Float[np.ndarray, "P C"]:
     with warnings.catch_warnings():
-        # Where a threshold leaves no term, the weights are zero, which their free runs evaluate.
+        # If a threshold leaves no term, the weights are zero, and free runs show whether that is good.
         warnings.simplefilter("ignore")
         optimiser = ps.STLSQ(threshold=threshold, alpha=1e-6, max_iter=30)
         optimiser.fit(phi, rate)
@@ -272,7 +274,7 @@ def _sparse_weights(ps: Any, phi: np.ndarray, rate: np.ndarray, threshold: float
 def _test_functions(
     n: int, order: int, Ts: float
 ) -> tuple[Float[np.ndarray, "K n"], Float[np.ndarray, "K n"]]:
-    """Smooth bumps that end at zero, and their derivatives with the sign of integration by parts."""
+    """Smooth test functions that are zero at their ends, and their derivatives for integration by parts."""
     half = max(6, min(60, n // 8))
     t = np.arange(-half, half + 1) / half
     bump = np.polynomial.Polynomial([1, 0, -1]) ** 4
@@ -286,7 +288,7 @@ def _test_functions(
 
 
 def _describe_sensitivity(tried: list[tuple[float, tuple[int, int], Smoothing, float]]) -> str:
-    """How much the choices matter, in words."""
+    """How much the result depends on the choices, in words."""
     best = min(tried)
     finite = [t[0] for t in tried if np.isfinite(t[0])]
     factor = np.exp(np.median(finite) - best[0])

@@ -1,4 +1,4 @@
-"""Terms of sparse equations of motion, their simulation, and free runs over many stretches at once."""
+"""Terms of sparse equations of motion, their simulation, and free runs over many segments at once."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -23,14 +23,15 @@ class Terms:
         1, u, q, v, v|v|, tanh(v / width) as a sign, the last for sums of two speeds too,
         and with degree 3 also q^2, q^3, v^3
 
-    Where the outputs are speeds themselves (order 1) there are no terms in q.
+    If the equations give rates of the outputs (order 1), the outputs take the place of the speeds v, and
+    there are no terms in q.
 
     Attributes:
         channels: Names of the outputs.
-        order: 2 where the equations give accelerations of the outputs, 1 where they give their rates.
-        degree: 3 for powers of outputs and speeds, 1 for none.
-        width: Speed within which the sign turns, for each output.
-        held: Whether the input is held between samples, or runs on smoothly.
+        order: 2 if the equations give accelerations of the outputs, 1 if they give their rates.
+        degree: 3 for powers of outputs and speeds, 1 for no powers.
+        width: For each output, speed over which the sign changes.
+        held: Whether the input is held between samples; otherwise it is smooth.
     """
 
     channels: tuple[str, ...]
@@ -41,7 +42,7 @@ class Terms:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the terms."""
+        """Names of the terms."""
         speeds = [f"{c}'" for c in self.channels] if self.order == 2 else list(self.channels)
         names = ["1", "u"]
         if self.order == 2:
@@ -77,10 +78,10 @@ class SparseEquations:
     """Equations of motion with few terms, as a simulator.
 
     Attributes:
-        terms: Library.
+        terms: Library of terms.
         W: Weights of the terms (P, C).
-        Ts: Sampling period that the first state is sought at [s].
-        speeds: Samples of the past that a speed is told from, one step ahead.
+        Ts: Sampling period for which the equations are simulated [s].
+        speeds: Number of past samples from which a speed is estimated for a prediction.
     """
 
     terms: Terms
@@ -89,7 +90,7 @@ class SparseEquations:
     speeds: int = 15
 
     def simulate(self, recording: Recording) -> Float[np.ndarray, "N C"]:
-        """Free run; the first state is the one that follows the first `n_init` samples best."""
+        """Free run; the first state is the best fit to the first `n_init` samples."""
         self._check(recording)
         u, m = recording.u.astype(float), recording.n_init
         x = self._start(u[:m], recording.y[:m].astype(float))
@@ -98,7 +99,7 @@ class SparseEquations:
         ]
 
     def predict(self, recording: Recording) -> Float[np.ndarray, "N C"]:
-        """One step ahead, from the last sample and the slope of the last few."""
+        """One-step-ahead prediction from the last sample, with speeds from the last few samples."""
         self._check(recording)
         y, C, k = recording.y.astype(float), len(self.terms.channels), self.speeds
         t = np.arange(-k + 1, 1) * self.Ts
@@ -115,7 +116,7 @@ class SparseEquations:
         require_period(self.Ts, recording.Ts, "The equations hold")
 
     def _start(self, u: np.ndarray, y: np.ndarray) -> Float[np.ndarray, " n"]:
-        """First state by Gauss-Newton, from a parabola through the samples."""
+        """First state by Gauss-Newton steps; the start is a parabola through the samples."""
         m, C = y.shape
         if m < 4:
             return np.concatenate([y[0], np.zeros(C)]) if self.terms.order == 2 else y[0]
@@ -150,7 +151,7 @@ def motions(
     u: Float[np.ndarray, "M N"],
     Ts: float,
 ) -> Float[np.ndarray, "K M N n"]:
-    """States of K models from M first states each, under M inputs."""
+    """States of K models from M first states each, with M inputs."""
     N = u.shape[1]
     padded = np.repeat(u[:, -1:], max(2, 1 << (N - 1).bit_length()), axis=1)
     padded[:, :N] = u
@@ -202,15 +203,15 @@ def _motions(
     return jax.vmap(lambda W, x: jax.vmap(lambda x, u: one(W, x, u))(x, within))(W, x0)
 
 
-# A model that leaves the measurement by so many of its ranges in a run over a whole recording is out.
+# A model is excluded if an output moves by more than this many measured ranges in a run over a recording.
 LARGEST_EXCURSION = 3.0
-# Difference quotients change a weight by this share, and a step must lower the mean log error by this much.
+# Share of a weight for difference quotients, and decrease of the mean log error that is worth a step.
 WEIGHT_DIFFERENCE, LOG_ERROR_TOLERANCE = 1e-4, 1e-5
 
 
 @dataclasses.dataclass(frozen=True)
 class Piece:
-    """A stretch of a recording: smoothed state at its start, input and outputs."""
+    """A segment of a recording: smoothed state at its start, input and outputs."""
 
     x0: Float[np.ndarray, " K"]
     u: Float[np.ndarray, " N"]
@@ -224,7 +225,7 @@ def costs(
     train: Sequence[Recording],
     states: Sequence[Float[np.ndarray, "N states"]],
 ) -> Float[np.ndarray, " L"]:
-    """Mean log error of free runs of several models over the pieces; infinite where one leaves the range."""
+    """Mean log error of free runs of several models over the pieces; infinite if a run leaves the range."""
     n, C = terms.order * len(terms.channels), len(terms.channels)
     with np.errstate(all="ignore"):
         e = _missed(terms, W, pieces, train[0].Ts)
@@ -240,7 +241,7 @@ def costs(
 def refined(
     terms: Terms, W: Float[np.ndarray, "P C"], pieces: Sequence[Piece], Ts: float, max_steps: int = 60
 ) -> Float[np.ndarray, "P C"]:
-    """The weights that are not zero, by damped least squares on free runs; each channel counts alike."""
+    """Weights with the non-zero ones refined by damped least squares on free runs; channels count equally."""
     where = np.nonzero(W)
     start = W[where]
     if not len(start):
@@ -258,7 +259,7 @@ def refined(
     def linearised(values: Float[np.ndarray, " K"]) -> NormalEquations:
         h = WEIGHT_DIFFERENCE * np.maximum(np.abs(values), 1e-3 * np.abs(start))
         e = _missed(terms, expanded(values + np.vstack([0 * h, np.diag(h)])), pieces, Ts)
-        # Errors in units of their own size have the gradient of the logarithm.
+        # The errors divided by their own size give the gradient of the logarithm.
         scaled = (e / (np.sqrt(np.mean(e[0] ** 2, axis=(0, 1))) + 1e-300)).reshape(len(e), -1)
         equations = NormalEquations.of(((scaled[1:] - scaled[0]) / h[:, None]).T, scaled[0])
         return equations._replace(costs=np.array([samples * _log_error(e[0])]))

@@ -1,4 +1,4 @@
-"""The result of a comparison: one row per method, best first, and the sensor noise."""
+"""The result of a comparison: one row for each method, best first, and the sensor noise."""
 
 import dataclasses
 import math
@@ -17,7 +17,7 @@ from rotflex_jax.text.numbers import digits, json_number, json_numbers, readable
 
 
 def cells(comparison: "Comparison") -> list[list[str]]:
-    """The table in words: headings, the methods that came through, the sensor noise."""
+    """The table as text: headings, the methods with the status `ok`, the sensor noise."""
     units = comparison.units
     head = ["method"]
     for what in (f"{comparison.window_seconds:g} s rms", "rms", "worst"):
@@ -68,27 +68,27 @@ ChannelErrors = dict[str, float]
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """One method.
+    """Result of one method.
 
     Attributes:
-        method: Its name.
-        title: What it is.
+        method: Name of the method.
+        title: Description of the method.
         family: Kind of method: `physics`, `linear`, `series`, `adaptive`, `sindy`, `learned` or `other`.
         status: `ok`, `diverged` or `failed`.
-        reason: Why it failed or diverged; "" where it did not.
-        note: What else to know: its order, what it left out or added.
+        reason: Why the method failed or diverged; "" if its status is `ok`.
+        note: Further information, such as its order, or what it left out or added.
         rmse: Channel -> root mean square error of one free run over the test data [unit].
-        nrmse: The same over the standard deviation of the measurement [-].
-        fit_percent: 100 (1 - nrmse) [%].
-        worst: Largest error of that free run [unit].
-        rmse_windows: Root mean square error of free runs that start again every few seconds [unit].
-        rmse_one_step: Root mean square error one step ahead [unit]; empty without a predictor.
-        horizon: Error of free runs by how far they have gone; None where the method failed.
-        parameters: Number of fitted parameters; None where the method failed.
-        fit_seconds: Time to learn [s], with the compilation of code that no earlier method needed.
-        simulate_seconds: Time of the free runs over the test data, compiled before [s].
-        simulator: The model that was learned; None where it failed.
-        simulated: Its free run over each test recording.
+        nrmse: Channel -> `rmse` divided by the standard deviation of the measurement [-].
+        fit_percent: Channel -> 100 (1 - nrmse) [%].
+        worst: Channel -> largest error of this free run [unit].
+        rmse_windows: Channel -> root mean square error of free runs over windows [unit].
+        rmse_one_step: Channel -> root mean square error one step ahead [unit]; empty without a predictor.
+        horizon: Error of free runs as a function of the horizon; None if the method failed.
+        parameters: Number of fitted parameters; None if the method failed.
+        fit_seconds: Time to learn [s], including compilation of code that no earlier method needed.
+        simulate_seconds: Time of the free runs over the test data, without compilation [s].
+        simulator: The learned model; None if the method failed.
+        simulated: Free run of the model over each test recording.
     """
 
     method: str
@@ -112,7 +112,7 @@ class Row:
 
     @property
     def score(self) -> float:
-        """Mean over the channels of the log of `rmse`; infinite unless the method is `ok`."""
+        """Mean over the channels of the logarithm of `rmse`; infinite unless the status is `ok`."""
         if self.status != "ok":
             return math.inf
         return float(np.mean([math.log(max(e, 1e-300)) for e in self.rmse.values()]))
@@ -147,12 +147,12 @@ class Row:
 
 @dataclasses.dataclass(frozen=True)
 class Comparison:
-    """Methods side by side.
+    """Results of several methods on the same data.
 
     Attributes:
-        rows: One per method, the smallest free-run error first, what diverged or failed last.
+        rows: One row for each method: smallest free-run error first, diverged and failed methods last.
         train: Training recordings.
-        test: Test recordings, of whose outputs no method had more than the first `n_init` samples.
+        test: Test recordings; of their outputs each method received only the first `n_init` samples.
         noise_floor: Channel -> standard deviation of the sensor noise [unit].
         window_seconds: Length of the windows [s].
         elapsed_s: Time taken [s].
@@ -167,7 +167,7 @@ class Comparison:
 
     @property
     def best(self) -> Row | None:
-        """The method with the smallest error of one free run (geometric mean over the channels)."""
+        """The method with the smallest error of one free run (geometric mean over the channels), if any."""
         return self.rows[0] if self.rows and self.rows[0].status == "ok" else None
 
     @property
@@ -178,7 +178,7 @@ class Comparison:
 
     @property
     def longest_test(self) -> int:
-        """Number of the longest test recording, the first of several."""
+        """Index of the longest test recording, the first of several."""
         return max(range(len(self.test)), key=lambda k: self.test[k].N)
 
     def __getitem__(self, method: str) -> Row:
@@ -205,7 +205,7 @@ class Comparison:
 
     @property
     def best_of_each_family(self) -> tuple[Row, ...]:
-        """The best method of each family that came through, best first."""
+        """The best method of each family among those with the status `ok`, best first."""
         first: dict[str, Row] = {}
         for row in self.rows:
             if row.status == "ok":
@@ -213,14 +213,14 @@ class Comparison:
         return tuple(first.values())
 
     def to_markdown(self) -> str:
-        """The table in Markdown, then a line for each method that has something to say."""
+        """The table in Markdown, then a line for each method with a remark."""
         head, *body = self.cells()
         align = ["---", *["---:"] * (len(head) - 1)]
         lines = ["| " + " | ".join(cells) + " |" for cells in (head, align, *body)]
         return "\n".join([*lines, "", *(f"- {line}" for line in self.remarks())]) + "\n"
 
     def to_frame(self) -> Any:
-        """The numbers as a pandas DataFrame, one row per method, in the units of the recordings.
+        """The numbers as a pandas DataFrame, one row for each method, in the units of the recordings.
 
         Raises:
             InputError: pandas is not installed.
@@ -261,11 +261,11 @@ class Comparison:
         return write(self, Path(folder))
 
     def cells(self) -> list[list[str]]:
-        """The table in words: headings, the methods that came through, the sensor noise."""
+        """The table as text: headings, the methods with the status `ok`, the sensor noise."""
         return cells(self)
 
     def __str__(self) -> str:
-        """The table, then a line for each method that has something to say."""
+        """The table, then a line for each method with a remark."""
         return "\n".join([*aligned(self.cells()), *self.remarks()])
 
     def _repr_html_(self) -> str:
@@ -279,7 +279,7 @@ class Comparison:
         )
 
     def remarks(self) -> list[str]:
-        """What there is to say about each method: why it failed, what it chose."""
+        """Remarks on the methods: why a method failed, what it chose."""
         lines = []
         for row in self.rows:
             said = "; ".join(filter(None, (row.reason, row.note)))

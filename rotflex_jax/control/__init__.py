@@ -1,4 +1,4 @@
-"""From a fitted model to a controller: designed, simulated on every model that is possible, written as C."""
+"""Controllers from fitted models: design, simulation on every model that the data leave possible, C code."""
 
 from rotflex_jax.control.assessment import ControlAssessment, assess, credible_models
 from rotflex_jax.control.c_code import controller_to_c

@@ -1,4 +1,4 @@
-"""One controller on every model that the data leave possible: the worst case, and which model breaks it."""
+"""Assessment of one controller on every model that the data leave possible, with the worst case."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MOST_DRAWS = 200
-"""Draws for one model before parameters count as lying outside of their bounds."""
+"""Most draws for one model; if all lie outside of the bounds, the distribution counts as outside."""
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -30,8 +30,8 @@ class ControlAssessment:
     """Runs of one controller on several models.
 
     Attributes:
-        controller: That drives all of them.
-        runs: By the name of the model.
+        controller: Controller of all runs.
+        runs: Name of a model -> its run in closed loop.
     """
 
     controller: Controller
@@ -39,12 +39,12 @@ class ControlAssessment:
 
     @property
     def worst(self) -> str:
-        """The model with the largest tracking error; one that diverges comes first."""
+        """Name of the model with the largest tracking error; a run that diverges counts as the largest."""
         return max(self.runs, key=lambda name: self.runs[name].rms)
 
     @property
     def broken(self) -> dict[str, str]:
-        """What happens to the models that the controller does not hold, by name."""
+        """Name of a model that diverges or has a limit cycle -> description of what happens."""
         found = {}
         for name, run in self.runs.items():
             if not run.bounded:
@@ -56,7 +56,7 @@ class ControlAssessment:
 
     @property
     def sentence(self) -> str:
-        """Worst case and what breaks it, in words."""
+        """The worst case, and the models that diverge or have a limit cycle, in words."""
         (rms, unit), worst = readable(self.runs[self.worst].rms, self.runs[self.worst].unit), self.worst
         error = "no bound" if not np.isfinite(rms) else f"{rms:.3g} {unit} rms"
         said = f"Worst case of {len(self.runs)} models: {error} with {worst}"
@@ -73,7 +73,7 @@ class ControlAssessment:
         }
 
     def plot(self) -> "Figure":
-        """All runs over each other."""
+        """Figure of all runs on common axes."""
         first, *others = self.runs.values()
         return first.plot(*others)
 
@@ -115,25 +115,25 @@ def assess(
     count: int = 20,
     seed: int = 0,
 ) -> ControlAssessment:
-    """The controller on every model that is still possible: tracking error, limit cycles, worst case.
+    """Simulates a controller on every model that is still possible: tracking error, limit cycles, worst case.
 
-    The reference stands still at its last value for a while, where a limit cycle would show.
+    At its end, the reference stands still at its last value, so that a limit cycle becomes visible.
 
     Args:
         controller: From `controller`.
-        models: By name, or one after the other, such as those between which a search could not decide; or a
-            `Fit`, from whose distribution of the parameters models are drawn.
-        reference: Of the port's position, one value for each sample.
-        hold: Time at the last value [s].
+        models: Models by name or as a list, such as equivalent models of a search; or a `Fit`, from whose
+            parameter distribution models are drawn.
+        reference: Reference of the port's position, one value for each sample.
+        hold: Time for which the last value is held [s].
         noise: Standard deviation of the noise of the sensors [rad].
-        count: How many models are drawn from a fit.
-        seed: Of draws and noise.
+        count: Number of models that are drawn from a fit.
+        seed: Seed of draws and noise.
 
     Returns:
         ControlAssessment.
 
     Raises:
-        InputError: No models, or one that is none.
+        InputError: There are no models, or one of them is not a model.
     """
     hold = number(hold, "hold", least=0.0, unit="s", example="6.0")
     noise = number(noise, "noise", least=0.0, unit="rad", example="0.001")
@@ -170,16 +170,16 @@ def credible_models(fit: Fit, count: int = 20, seed: int = 0) -> dict[str, Model
     """The fitted model, and models drawn from the distribution of its parameters.
 
     Args:
-        fit: Its covariance is that of a normal distribution about the estimates; draws outside of the bounds
-            of a parameter are left out.
-        count: How many models are drawn.
-        seed: Of the draws.
+        fit: Parameters are drawn from a normal distribution with its estimates and covariance. A draw outside
+            of the bounds of a parameter is repeated.
+        count: Number of models that are drawn.
+        seed: Seed of the draws.
 
     Returns:
         Models by name.
 
     Raises:
-        InputError: No fit, or estimates whose intervals lie outside of their bounds.
+        InputError: `fit` is no fit, or its intervals lie almost wholly outside of the bounds.
     """
     if not isinstance(fit, Fit):
         raise InputError(f"Argument `fit` must be the result of a fit, but is {shown(fit)}; call rf.fit.")
@@ -192,7 +192,7 @@ def credible_models(fit: Fit, count: int = 20, seed: int = 0) -> dict[str, Model
     low = np.array([bounds[name].lower for name in names], float)
     high = np.array([bounds[name].upper for name in names], float)
     covariance = fit.covariance[np.ix_(known, known)]
-    # An estimate without an interval, such as one at a bound, stays where it is.
+    # An estimate without an interval, such as one at a bound, is not varied.
     certain = ~np.isfinite(np.diag(covariance))
     covariance = np.where(certain[:, None] | certain[None, :], 0.0, covariance)
     found = {"fitted": fit.model}

@@ -23,19 +23,19 @@ def controller_to_c(
         control_state s;  control_init(&s);
         for (;;) u = control_step(&s, y, y_plan, u_plan);    /* y read now, u held until the next sample */
 
-    `y_plan` and `u_plan` are outputs and voltage of the planned motion; for a reference that is given here
-    they stand in the tables `control_y_plan` and `control_u_plan`, of which each row is one sample.
+    `y_plan` and `u_plan` are outputs and voltage of the planned motion. With a `reference`, the code also
+    contains them as tables `control_y_plan` and `control_u_plan`, with one row for each sample.
 
     Args:
         controller: From `controller`.
-        reference: Motion whose plan is to be part of the code.
+        reference: Reference whose planned motion is included in the code; None for no tables.
         prefix: Prefix of the names in the code.
 
     Returns:
         The text of a header that contains everything; functions are `static`.
 
     Raises:
-        InputError: A prefix that begins no name in C, or a reference that is no signal.
+        InputError: The prefix is no valid start of a name in C, or the reference is no signal.
     """
     if not (isinstance(prefix, str) and re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", prefix)):
         raise InputError(
@@ -112,7 +112,7 @@ def controller_to_c(
 
 
 def _array(declared: str, values: np.ndarray) -> str:
-    """A constant array; digits carry the numbers exactly."""
+    """Definition of a constant array in C, with enough digits to represent the numbers exactly."""
     rows = [", ".join(repr(float(v)) for v in row) for row in np.atleast_2d(values)]
     inside = rows[0] if values.ndim == 1 else ",\n    ".join(f"{{{row}}}" for row in rows)
     return f"static const double {declared} = {{\n    {inside}\n}};"

@@ -1,4 +1,4 @@
-"""A controller in the loop: with a model, whose every effect acts, or with a machine that is an object."""
+"""A controller in closed loop: with a simulated model and all its effects, or with a real machine."""
 
 import dataclasses
 import functools
@@ -28,27 +28,27 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 COMMANDS_KEPT = 128
-"""Commands before the present one that an amplifier may still be working on."""
+"""Number of latest commands, the present one included, on which the voltage at the motor may depend."""
 
 SETTLING_SHARE = 1 / 3
-"""Of the time at rest, that no limit cycle is looked for in."""
+"""Share of the time at a constant reference that is left for settling before a limit cycle is looked for."""
 
 SHORTEST_REST = 1.0
-"""Time for which a reference must stand still before a limit cycle is looked for [s]."""
+"""Least time at a constant reference for which a limit cycle is looked for [s]."""
 
 SUSTAINED = 0.9
-"""An oscillation whose second half is smaller than this share of its first one dies out."""
+"""An oscillation dies out if its size in the second half is below this share of its size in the first."""
 
 COUNTS_OF_CYCLE = 2.5
-"""An oscillation that is smaller than so many steps of a sensor, from end to end, is that of the steps."""
+"""Least peak-to-peak size of a limit cycle, in steps of the finest sensor; the steps cause smaller ones."""
 
 
 class LimitCycle(NamedTuple):
-    """A sustained oscillation where the reference stands still.
+    """A sustained oscillation at a constant reference.
 
     Attributes:
-        amplitude: Half of its height [rad].
-        frequency: Of it [Hz].
+        amplitude: Half of the peak-to-peak size [rad].
+        frequency: Frequency of the oscillation [Hz].
     """
 
     amplitude: float
@@ -60,24 +60,24 @@ class Plant(Protocol):
     """A machine, or a simulator of one, that a controller may drive."""
 
     def read(self) -> Any:
-        """Readings of the sensors now, in the order of the model's channels."""
+        """Present readings of the sensors, in the order of the model's channels."""
         ...
 
     def advance(self, voltage: float) -> Any:
-        """Hold the voltage [V] over one sample."""
+        """Applies the voltage [V] and holds it over one sample."""
         ...
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class ClosedLoop:
-    """A run under a controller.
+    """A run in closed loop.
 
     Attributes:
-        controller: What drove it.
-        motion: What was planned.
+        controller: The controller.
+        motion: The planned motion.
         outputs: Readings of the sensors.
-        position: Of the controlled port; of a machine, from its readings.
-        voltage: That was given [V].
+        position: Position of the controlled port [rad]; for a machine, computed from its readings.
+        voltage: Applied voltage [V].
         states: Observed states of the linear part.
         load: Observed load torque [N m].
     """
@@ -97,7 +97,7 @@ class ClosedLoop:
 
     @property
     def unit(self) -> str:
-        """Of position and error."""
+        """Unit of position and error."""
         return self.controller.model.mechanism.units.motion
 
     @property
@@ -107,12 +107,12 @@ class ClosedLoop:
 
     @property
     def rms(self) -> float:
-        """Tracking error, root mean square [rad]; infinite where the run diverged."""
+        """Root mean square tracking error [rad]; infinite if the run diverged."""
         return float(np.sqrt(np.mean(self.error**2))) if self.bounded else np.inf
 
     @property
     def largest(self) -> float:
-        """Largest tracking error [rad]."""
+        """Largest magnitude of the tracking error [rad]; infinite if the run diverged."""
         return float(np.max(np.abs(self.error))) if self.bounded else np.inf
 
     @property
@@ -122,17 +122,18 @@ class ClosedLoop:
 
     @property
     def bounded(self) -> bool:
-        """Whether all positions are finite and within a thousand times what was asked for."""
+        """Whether all positions are finite and below 1000 (1 + largest reference) in magnitude."""
         most = 1e3 * (1 + np.max(np.abs(self.motion.reference)))
         return bool(np.all(np.isfinite(self.position)) and np.max(np.abs(self.position)) < most)
 
     @functools.cached_property
     def limit_cycle(self) -> LimitCycle | None:
-        """The oscillation in which the run ends although the reference stands still, None for none.
+        """Sustained oscillation at the end of the run, while the reference is constant; None without one.
 
-        The end of the reference must be constant for a second or more. Its first third is left for settling,
-        the rest is halved: in each half the position must pass its middle twice, the oscillation be larger
-        than the steps of the sensors, and not die out.
+        The reference must be constant for its last second or longer. The first third of this time is left for
+        settling, the rest is halved. In each half, the position must cross the middle of its range at least
+        twice. In the second half, the oscillation must be larger than the steps of the finest sensor and not
+        clearly smaller than in the first half.
         """
         Ts, r = self.controller.Ts, self.motion.reference
         moving = np.flatnonzero(r != r[-1])
@@ -182,14 +183,14 @@ class ClosedLoop:
         )
 
     def plot(self, *others: "ClosedLoop") -> "Figure":
-        """Position, error, voltage and observed load over time, beside other runs; a notebook shows it."""
-        from rotflex_jax.control.figure import loop_figure  # draws, and is loaded on request
+        """Figure of position, error, voltage and observed load over time, with other runs beside them."""
+        from rotflex_jax.control.figure import loop_figure  # loads matplotlib, so only on request
 
         return loop_figure(self, *others)
 
 
 class _Gains(NamedTuple):
-    """What the feedback is made of, as arrays of NumPy or JAX."""
+    """Matrices, gains and limit of a controller, as arrays of NumPy or JAX."""
 
     A: Any
     B: Any
@@ -200,7 +201,7 @@ class _Gains(NamedTuple):
 
 
 def _feedback(g: _Gains, e: Any, y: Any, y_plan: Any, u_plan: Any) -> tuple[Any, Any, Any]:
-    """Voltage, corrected deviation and the next one; for arrays of NumPy and JAX."""
+    """Voltage, corrected deviation from the plan and predicted next one, for arrays of NumPy or JAX."""
     e = e + g.L @ (y - y_plan - g.C @ e)
     u = (u_plan - g.K @ e).clip(-g.limit, g.limit)
     return u, e, g.A @ e + g.B * (u - u_plan)
@@ -220,9 +221,13 @@ def _run(
     step: Array,
     Ts: Array,
 ) -> tuple[Array, ...]:
-    """States (N, n), readings, voltages and deviations of the observer of a run in closed loop."""
+    """States (N, n), readings, voltages and observed deviations of a run in closed loop.
+
+    The last result is the largest error of the motor's voltage in the loop, which is computed there from the
+    latest `COMMANDS_KEPT` commands.
+    """
     mechanism = structure.with_values(values)
-    c: Any = solver.prepare(structure, values, gates, Ts)  # each solver takes those it has made
+    c: Any = solver.prepare(structure, values, gates, Ts)  # the type depends on the solver
     acted = bool(effects_of(structure, Actuation))
 
     def body(carry: Any, w: Any) -> tuple[Any, Any]:
@@ -241,7 +246,7 @@ def _run(
     kept = jnp.full(COMMANDS_KEPT if acted else 0, u_plan[0])
     start = (x0, jnp.zeros(len(gains.B)), kept)
     X, Y, u, E, v = jax.lax.scan(body, start, (y_plan, u_plan, noise))[1]
-    # What the amplifier makes of the whole sequence, which the loop must not differ from.
+    # Voltage at the motor from the whole sequence of commands, for comparison with the loop.
     before = jnp.full(COMMANDS_KEPT if acted else 0, u_plan[0])
     whole = motor_voltage(mechanism, gates, jnp.concatenate([before, u]), Ts)[len(before) :]
     return X, Y, u, E, jnp.max(jnp.abs(whole - v))
@@ -255,24 +260,25 @@ def close_loop(
     noise: float = 0.0,
     seed: int | np.random.Generator = 0,
 ) -> ClosedLoop:
-    """A run of a model or a machine under a controller, along a reference.
+    """Runs a model or a machine in closed loop along a reference.
 
-    A model starts at rest at the beginning of the reference, with all its effects, and its sensors show whole
-    steps of what noise has been added to. A machine is read and driven sample by sample.
+    A model is simulated with all its effects, from rest at the first value of the reference. Noise is added
+    to its outputs, which are then rounded to the steps of the sensors. A machine is read and driven sample by
+    sample.
 
     Args:
         controller: From `controller`.
         plant: Model or mechanism, or an object with `read()` and `advance(voltage)`.
-        reference: Of the port's position, one value for each sample.
-        noise: Standard deviation of what is added to a reading of a model ahead of its steps [rad].
-        seed: Of the noise.
+        reference: Reference of the port's position, one value for each sample.
+        noise: Standard deviation of the noise that is added to outputs of a model before rounding [rad].
+        seed: Seed of the noise.
 
     Returns:
         ClosedLoop.
 
     Raises:
-        InputError: A plant that is none, one with other channels than the controller, or a reference that
-            is no signal.
+        InputError: `plant` is neither a model nor a machine, its channels are not the controller's, or
+            `reference` is no signal.
     """
     noise = number(noise, "noise", least=0.0, unit="rad", example="0.001")
     instance(controller, Controller, "controller", "make one with rotflex_jax.controller")
@@ -286,7 +292,7 @@ def run_loop(
     noise: float = 0.0,
     seed: int | np.random.Generator = 0,
 ) -> ClosedLoop:
-    """`close_loop` along a motion that is planned already."""
+    """`close_loop` along a motion that has been planned before."""
     if isinstance(plant, Model | Mechanism):
         model = Model.of(plant)
         check_input_alone(model.mechanism, "a closed loop")
@@ -330,7 +336,7 @@ def _with_model(
     x0 = rest_state(structure, np.float64)
     row = np.zeros(layout.size)
     row[: layout.n] = mechanism.port_vectors[controller.port]
-    # All other coordinates at rest: the shortest vector that puts the port there.
+    # Shortest vector of coordinates that puts the port at the first value of the reference.
     x0[: layout.n] = row[: layout.n] * motion.reference[0] / (row @ row)
     if len(own.coordinates) == layout.n:
         x0[: layout.n] = motion.states[0, : layout.n]

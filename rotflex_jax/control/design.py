@@ -1,4 +1,4 @@
-"""A controller of a fitted model: state feedback, observer of the load, compensation of what was found."""
+"""Design of a controller: state feedback, observer of states and load, compensation of other effects."""
 
 import dataclasses
 import functools
@@ -32,19 +32,19 @@ from rotflex_jax.runtime.persistent_jit import persistent_jit
 from rotflex_jax.runtime.xla import double_precision
 
 PASSES = 4
-"""Times that torques and motion are computed from each other."""
+"""Number of iterations in which torques and planned motion are computed from each other in turn."""
 
 
 @dataclasses.dataclass(frozen=True)
 class PlannedMotion:
-    """Where the linear part is to be at each sample, and the voltage that brings it there.
+    """Planned states of the linear part at each sample, and the voltage that leads it along them.
 
     Attributes:
-        reference: Of the controlled position.
-        states: Of the linear part.
-        outputs: What the sensors should show.
-        voltage: Feed-forward [V].
-        torques: Of the compensated effects, in the order of the torque ports [N m].
+        reference: Reference of the controlled position.
+        states: Planned states of the linear part.
+        outputs: Planned outputs.
+        voltage: Feed-forward voltage [V].
+        torques: Torques of the compensated effects, in the order of the torque ports [N m].
     """
 
     reference: Float[np.ndarray, " N"]
@@ -56,15 +56,15 @@ class PlannedMotion:
 
 @dataclasses.dataclass(frozen=True)
 class Tracking:
-    """Quadratic optimal tracking of a reference that is known beforehand, by the linear part.
+    """Linear quadratic tracking of a reference that is known beforehand, by the linear part.
 
         x+ = A x + B u + d,   minimise  sum (c x - r)^2 + effort u^2
 
     Attributes:
-        A: From sample to sample.
-        B: Of the voltage.
-        c: Row of the controlled position.
-        effort: What a square volt costs [rad^2/V^2].
+        A: State matrix in discrete time.
+        B: Input matrix of the voltage in discrete time.
+        c: Output row of the controlled position.
+        effort: Weight of the squared voltage [rad^2/V^2].
 
     Source: B. D. O. Anderson and J. B. Moore, Optimal Control: Linear Quadratic Methods, 1990, chapter 4.
     """
@@ -77,11 +77,11 @@ class Tracking:
     def solve(
         self, reference: Float[np.ndarray, " N"], pushes: Float[np.ndarray, "N n"]
     ) -> tuple[Float[np.ndarray, "N n"], Float[np.ndarray, " N"]]:
-        """States and voltages; what pushes the state in each sample (`d`) is known.
+        """Optimal states and voltages, with known disturbances.
 
         Args:
-            reference: Held at its last value after the end.
-            pushes: Of the state, sample by sample.
+            reference: Reference r; its last value is held after the end.
+            pushes: Disturbance d of the state in each sample.
         """
         A, B, c = self.A, self.B, self.c
         P = scipy.linalg.solve_discrete_are(A, B[:, None], np.outer(c, c), [[self.effort]])
@@ -89,7 +89,7 @@ class Tracking:
         K = gain * (B @ P @ A)
         closed = (A - np.outer(B, K)).T
         N = len(reference)
-        # What is still to come, summed up backwards; the recursion is linear in c r and d.
+        # Backward recursion for the effect of future references and disturbances, linear in c r and d.
         given = reference[:, None] * c - pushes @ P @ closed.T
         ahead = np.empty((N + 1, len(c)))
         ahead[N] = np.linalg.solve(np.eye(len(c)) - closed, given[-1])
@@ -107,7 +107,7 @@ class Tracking:
 def at_rest(
     A: Float[np.ndarray, "n n"], B: Float[np.ndarray, " n"], c: Float[np.ndarray, " n"], position: float
 ) -> Float[np.ndarray, " n"]:
-    """The state in which the linear part stands at a position: `x = A x + B u`, `c x = position`."""
+    """State of the linear part at rest at a position: `x = A x + B u`, `c x = position`."""
     n = len(c)
     rows = np.block([[A - np.eye(n), B[:, None]], [c[None], np.zeros((1, 1))]])
     return np.linalg.lstsq(rows, np.append(np.zeros(n), position), rcond=None)[0][:n]
@@ -124,7 +124,7 @@ def _torques_along(
     rest: Array,
     Ts: Array,
 ) -> Array:
-    """Torques (p, N) of all effects but the linear ones along a motion (m, N)."""
+    """Torques (p, N) of all effects except the linear ones along a motion (m, N)."""
     mechanism, layout = structure.with_values(values), Layout.of(structure)
     z = jnp.zeros((0, x.shape[1]), x.dtype)
     if effects_of(mechanism, Memory):
@@ -150,14 +150,14 @@ def _torques_along(
 def torques_along(
     model: Model, X: Float[np.ndarray, "N n"], v: Float[np.ndarray, " N"], rest: float, Ts: float
 ) -> Float[np.ndarray, "N p"]:
-    """Torques of friction, forces and memories at the torque ports, where a motion is given [N m].
+    """Torques of friction, forces and memories at the torque ports, along a given motion [N m].
 
-    Dry friction acts against the motion; below the speed `rest` it falls to zero linearly, for where nothing
-    is to move it holds by itself and needs no voltage.
+    Dry friction acts against the motion. Below the speed `rest` it decreases linearly to zero, since at rest
+    friction holds the port without any voltage.
 
     Args:
-        model: Its effects are evaluated.
-        X: States of the linear part, without those of a gear's rotor.
+        model: Model whose effects are evaluated.
+        X: States of the linear part, without the states of a gear's rotor.
         v: Voltage [V].
         rest: Speed below which a port counts as being at rest [rad/s].
         Ts: Sampling period [s].
@@ -178,46 +178,47 @@ def torques_along(
 Compensation = Literal["nothing", "feedforward", "observer", "both"]
 
 PLANNED_EFFORT = 1e-4
-"""Weight of the voltage in a planned motion, next to that of the feedback: no noise comes with it."""
+"""Weight of the voltage in a planned motion, relative to the feedback: a plan amplifies no sensor noise."""
 
 LOAD_PER_SECOND = 0.1
-"""How fast the load may change: standard deviation over a second, as a share of the motor's torque."""
+"""Standard deviation of the change of the load over a second, as a share of the motor's largest torque."""
 
 WHITE_SHARE = 0.01
-"""Torque noise of a sample at each port, for what the model lacks, as a share of the motor's torque."""
+"""Standard deviation of the torque noise of a sample at each port, which represents what the model lacks, as
+a share of the motor's largest torque."""
 
 AT_REST = 20.0
-"""A port that moves slower than so many steps of its sensor in a second is to stand [1/s]."""
+"""Speed below which a port is planned to be at rest, in steps of the finest sensor per second [1/s]."""
 
 ENCODER = 2 * np.pi / 4096
-"""Step of the sensors unless it is given [rad]."""
+"""Default step of the sensors [rad]."""
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class Controller:
-    """Discrete feedback about a planned motion: from `controller`.
+    """Feedback in discrete time about a planned motion; made by `controller`.
 
         e  = e_hat + L (y - y_plan - C e_hat)                state and load, corrected by the sensors
         u  = clip(u_plan - K e)
-        e_hat+ = A e + B (u - u_plan)                        the voltage that was really given
+        e_hat+ = A e + B (u - u_plan)                        prediction with the limited voltage
 
     Attributes:
-        model: What it was designed for.
+        model: Model for which the controller was designed.
         Ts: Sampling period [s].
-        port: Whose position follows the reference.
+        port: Port whose position follows the reference.
         limit: Largest voltage [V].
-        compensate: What counters the torques beside the linear part.
-        A: Of the states and the load torque, from sample to sample.
-        B: Of the voltage.
-        C: Sensors.
-        K: Feedback of states and load.
+        compensate: Compensation of the effects outside the linear part.
+        A: Matrix of states and load torque in discrete time.
+        B: Input matrix of the voltage in discrete time.
+        C: Output matrix of the sensors.
+        K: Feedback gains of states and load.
         L: Gain of the observer.
         row: The controlled position as a combination of the states.
-        push: What torques at the torque ports do to the states within a sample.
+        push: Change of the states in one sample by torques at the torque ports.
         states: Names of the states; the last one is the load torque.
         resolution: Step of each sensor.
-        effort: What a square volt costs next to a square error [rad^2/V^2].
-        left_out: Effects that nothing compensates, one sentence each.
+        effort: Weight of the squared voltage relative to the squared error [rad^2/V^2].
+        left_out: Effects that are not compensated, one sentence each.
     """
 
     model: Model
@@ -239,27 +240,27 @@ class Controller:
 
     @property
     def input_name(self) -> str:
-        """What it gives, the `voltage` of a motor or another `input` such as a goal or a current."""
+        """`voltage` if the controller gives a voltage; otherwise `input`, such as a goal or a current."""
         return "voltage" if self.model.mechanism.units.input == "V" else "input"
 
     @functools.cached_property
     def poles(self) -> Complex[np.ndarray, " n"]:
-        """Poles of the loop on the linear part, as those of continuous time [1/s]."""
+        """Closed-loop poles of the linear part with state feedback, in continuous time [1/s]."""
         n = len(self.row)
         inside = self.A[:n, :n] - np.outer(self.B[:n], self.K[:n])
         return np.log(np.linalg.eigvals(inside).astype(complex)) / self.Ts
 
     def plan(self, reference: Float[ArrayLike, " N"] | Sequence[float]) -> PlannedMotion:
-        """The motion for a reference that is known beforehand.
+        """Planned motion for a reference that is known beforehand.
 
-        The linear part is to follow it as closely as a moderate voltage allows, with the torques of friction
-        and all other effects along that motion in the equations where they are compensated.
+        The linear part follows the reference as closely as a moderate voltage allows. With the compensation
+        "feedforward" or "both", the plan takes account of friction and of the other effects along the motion.
 
         Args:
-            reference: Of the port's position, one value for each sample.
+            reference: Reference of the port's position, one value for each sample.
 
         Raises:
-            InputError: No signal of finite numbers.
+            InputError: `reference` is no signal of finite numbers.
         """
         r = signal(reference, "reference").astype(float)
         n, N = len(self.row), len(r)
@@ -267,7 +268,7 @@ class Controller:
         tau = np.zeros((N, self.push.shape[1]))
         X, u = tracking.solve(r, tau @ self.push.T)
         if self.compensate in ("feedforward", "both") and tau.size:
-            # Of all sensors the finest says what a slow motion is.
+            # The finest sensor determines below which speed a port counts as being at rest.
             rest = AT_REST * float(self.resolution.min())
             for _ in range(PASSES):
                 tau = torques_along(self.model, X, u, rest, self.Ts)
@@ -275,7 +276,7 @@ class Controller:
         return PlannedMotion(r, X, X @ self.C[:, :n].T, u, tau)
 
     def first_state(self, position: float) -> Float[np.ndarray, " n"]:
-        """States of the linear part at rest at a position of the port."""
+        """States of the linear part when the port is at rest at a position."""
         n = len(self.row)
         return at_rest(self.A[:n, :n], self.B[:n], self.row, position)
 
@@ -305,34 +306,35 @@ def controller(
     load: str | None = None,
     resolution: float | Mapping[str, float] = ENCODER,
 ) -> Controller:
-    """A controller for the position of a port, from a fitted model.
+    """A controller for the position of a port, designed from a fitted model.
 
-    Feedback and observer are those of the linear part: a linear quadratic regulator that gives the whole
-    voltage for an error of `accuracy` in the position or any coordinate (Bryson's rule), or the gains for
-    given poles, and a steady Kalman filter of the states and of a load torque that walks at random. What the
-    model has beside its linear part is compensated along the planned motion ("feedforward"), by the observed
-    load ("observer", which also counters what the model does not know, but may oscillate where a joint
-    sticks), or by both.
+    Feedback and observer are designed for the linear part of the model. The feedback is a linear quadratic
+    regulator whose weights give an error of `accuracy` in the position or in any coordinate the same cost as
+    the largest voltage (Bryson's rule); with `poles`, it places these poles instead. The observer is a steady
+    Kalman filter for the states and for a load torque, which is modelled as a random walk. Effects outside
+    the linear part are compensated along the planned motion ("feedforward"), by the observed load
+    ("observer"), or by both. The observed load also counters torques that the model lacks, but may cause an
+    oscillation where a joint sticks.
 
-    Not for an unstable plan: a position whose zeros are unstable, such as the tip of a long arm, follows
-    with the voltage that is allowed, not exactly.
+    Not for exact tracking of a position with unstable zeros, such as the tip of a long arm: it follows the
+    reference only as closely as the voltage allows.
 
     Args:
         model: Fitted model, mechanism, or a `Fit`.
         Ts: Sampling period of the controller [s].
-        port: Whose position follows the reference.
-        accuracy: Error that is worth the whole voltage [rad].
-        limit: Largest voltage [V], or input in the unit of the model's.
-        poles: Of the loop in continuous time [1/s], one for each state; the regulator's unless given.
+        port: Port whose position follows the reference.
+        accuracy: Error with the same cost as the largest voltage [rad].
+        limit: Largest voltage [V], or largest input in the unit of the model's input.
+        poles: Closed-loop poles in continuous time [1/s], one for each state; None for the regulator's.
         compensate: "nothing", "feedforward", "observer" or "both".
         load: Port where the load torque acts; `port` unless given.
-        resolution: Step of the sensors [rad], or by channel.
+        resolution: Step of all sensors [rad], or channel -> step.
 
     Returns:
         Controller.
 
     Raises:
-        InputError: An argument that makes no sense, or a motor that cannot move the port.
+        InputError: An argument is out of range or of the wrong kind, or the motor cannot move the port.
 
     Source: B. D. O. Anderson and J. B. Moore, Optimal Control: Linear Quadratic Methods, 1990; G. F.
     Franklin, J. D. Powell and M. Workman, Digital Control of Dynamic Systems, 3rd ed., 1998, chapter 8.
@@ -355,7 +357,7 @@ def controller(
     step = _steps(resolution, mechanism)
     check_movable(mechanism)
     layout = Layout.of(mechanism.structure)
-    n, size = layout.n, layout.rotor  # where a gear has play, its rotor moves with its port
+    n, size = layout.n, layout.rotor  # the rotor of a gear with play is taken to move with its port
     with double_precision():
         eq = equations(mechanism, jnp.asarray(model.parameters_and_gates()[1]))
         A, B, ports, inverse = (
@@ -375,7 +377,7 @@ def controller(
     held = zero_order_hold(A, np.column_stack([B, torque_at[load], ports]), Ts)
     Ad, Bd, pushed, push = held[0], held[1][:, 0], held[1][:, 1], held[1][:, 2:]
     effort = (accuracy / limit) ** 2
-    shown_by = np.vstack([row, np.eye(n, size)])  # the position, and all that swings beside it
+    shown_by = np.vstack([row, np.eye(n, size)])  # the controlled position, then every coordinate
     K = _placed(Ad, Bd, poles, Ts) if poles is not None else _regulator(Ad, Bd, shown_by, effort)
     C = np.zeros((len(mechanism.channels), size + 1))
     C[:, : 2 * n] = layout.output_rows
@@ -421,7 +423,7 @@ def _steps(resolution: Any, mechanism: Mechanism) -> np.ndarray:
 
 
 def _balance(A: np.ndarray, B: np.ndarray, row: np.ndarray, torque: np.ndarray) -> float | None:
-    """Steady voltage that balances a unit torque and leaves the position; None where there is none."""
+    """Steady voltage that balances a unit torque at an unchanged position; None if there is none."""
     n = len(row)
     rows = np.block([[A, B[:, None]], [row[None], np.zeros((1, 1))]])
     found = np.linalg.lstsq(rows, np.append(-torque, 0.0), rcond=None)[0]
@@ -441,7 +443,7 @@ def _regulator(A: np.ndarray, B: np.ndarray, rows: np.ndarray, effort: float) ->
 
 
 def _placed(A: np.ndarray, B: np.ndarray, poles: Any, Ts: float) -> np.ndarray:
-    """Gains for poles in continuous time."""
+    """Feedback gains that place given poles, which are in continuous time."""
     try:
         wanted = np.asarray(poles, complex)
     except (TypeError, ValueError, OverflowError):
@@ -461,7 +463,7 @@ def _placed(A: np.ndarray, B: np.ndarray, poles: Any, Ts: float) -> np.ndarray:
 
 
 def _observer(A: np.ndarray, C: np.ndarray, Q: np.ndarray, R: np.ndarray) -> np.ndarray:
-    """Gain of the steady Kalman filter, for the correction by the present sample."""
+    """Gain of the steady Kalman filter in filter form: the present sample corrects the present state."""
     try:
         P = scipy.linalg.solve_discrete_are(A.T, C.T, Q, R)
     except (np.linalg.LinAlgError, ValueError) as error:

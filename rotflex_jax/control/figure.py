@@ -1,4 +1,4 @@
-"""The figure of runs in closed loop."""
+"""Figure of runs in closed loop."""
 
 import math
 

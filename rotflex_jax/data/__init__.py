@@ -1,4 +1,4 @@
-"""Recordings from files, from public data sets, and inputs to record with."""
+"""Recordings from files and from public data sets, and input signals for experiments."""
 
 from rotflex_jax.data import datasets as datasets, excitation as excitation
 from rotflex_jax.data.datasets import (

@@ -1,6 +1,6 @@
-"""Binary files, spreadsheets and DataFrames as tables; packages other than SciPy are imported on use.
+"""Binary files, spreadsheets and DataFrames as tables; optional packages are imported on use.
 
-pyarrow tells it too, but ends the interpreter where the description is damaged.
+The description of a Parquet file is read here: pyarrow reads it too, but a damaged one ends the interpreter.
 
 Source:
     Apache Parquet, File format and parquet.thrift; Apache Thrift, Compact protocol.
@@ -24,14 +24,14 @@ from rotflex_jax.recording.quality import SHORTEST_RECORDING
 
 
 def table_from_xlsx(path: Path, max_bytes: int = MAX_BYTES) -> Table:
-    """The columns of the first sheet that has any; names in its first row, units in the next or nowhere.
+    """The columns of the first sheet that has any: names in its first row, possibly units in the second.
 
     Raises:
         InputError: openpyxl is missing, the file is damaged or too large, or no sheet has names and numbers.
     """
     openpyxl: Any = optional("openpyxl", f"Reading {path.name}")
     try:
-        with zipfile.ZipFile(path) as archive:  # a part that is larger than it says fails its checksum
+        with zipfile.ZipFile(path) as archive:  # a part larger than its stated size fails its checksum
             check_size(path.name, sum(part.file_size for part in archive.infolist()), max_bytes)
         book = openpyxl.load_workbook(path, read_only=True, data_only=True)
         sheets = [(name, _filled(book[name])) for name in book.sheetnames if hasattr(book[name], "iter_rows")]
@@ -47,7 +47,7 @@ def table_from_xlsx(path: Path, max_bytes: int = MAX_BYTES) -> Table:
 
 
 def _filled(sheet: Any) -> list[tuple[int, tuple[Any, ...]]]:
-    """Rows that are not empty, with their numbers as the spreadsheet counts."""
+    """Rows that are not empty, with their numbers in the spreadsheet."""
     rows = enumerate(sheet.iter_rows(values_only=True), 1)
     return [(k, row) for k, row in rows if any(cell is not None for cell in row)]
 
@@ -82,7 +82,7 @@ def _column(values: list[Any]) -> np.ndarray:
 
 
 DEEPEST_STRUCTURE = 30
-"""Structures of the description within one another."""
+"""Largest depth of nested structures in the description."""
 
 _BYTE_ARRAY, _FIXED_LENGTH = 6, 7  # physical types
 _TRUE, _FALSE, _BYTE, _DOUBLE, _BINARY, _LIST, _SET, _MAP, _STRUCT = 1, 2, 3, 7, 8, 9, 10, 11, 12
@@ -92,9 +92,9 @@ class ParquetColumn(NamedTuple):
     """A column of one group of rows.
 
     Attributes:
-        name: with those of the structures around it, joined by points.
-        size: when unpacked, words counted once [bytes].
-        is_text: whether its values have lengths of their own.
+        name: name, with the names of the structures around it, joined by points.
+        size: unpacked size, with repeated words counted once [bytes].
+        is_text: whether its values have variable length.
     """
 
     name: str
@@ -136,20 +136,20 @@ def columns_of_parquet(path: Path) -> list[ParquetColumn]:
 
 
 class _Description:
-    """Structures in the compact protocol: a dictionary for each, by the numbers of the fields."""
+    """Reader of structures in the compact protocol: each is a dictionary, by the numbers of the fields."""
 
     def __init__(self, data: bytes) -> None:
         self.data, self.at = data, 0
 
     def take(self, count: int) -> bytes:
-        """The next bytes."""
+        """The next `count` bytes."""
         self.at += count
         if self.at > len(self.data):
             raise ValueError("its description is incomplete")
         return self.data[self.at - count : self.at]
 
     def natural(self) -> int:
-        """A number in groups of seven bits."""
+        """A non-negative whole number, stored in groups of seven bits."""
         value = 0
         for shift in range(0, 70, 7):
             byte = self.take(1)[0]
@@ -159,7 +159,7 @@ class _Description:
         raise ValueError("a number of its description is too long")
 
     def whole(self) -> int:
-        """A number that may be negative."""
+        """A whole number that may be negative."""
         value = self.natural()
         return (value >> 1) ^ -(value & 1)
 
@@ -176,7 +176,7 @@ class _Description:
         return found
 
     def value(self, kind: int, depth: int) -> Any:
-        """A value of a type; of truths in a list, one byte each."""
+        """A value of a type; truth values in a list have one byte each."""
         if kind in (_TRUE, _FALSE, _BYTE):
             return self.take(1)[0]
         if kind < _DOUBLE:
@@ -206,7 +206,7 @@ def read_mat(path: Path, max_bytes: int = MAX_BYTES) -> dict[str, Any]:
     """All variables of a MATLAB file up to version 7.2, structures as nested dictionaries.
 
     Raises:
-        InputError: the file is damaged, or none, or larger than `max_bytes` when unpacked.
+        InputError: the file is damaged, no MATLAB file, or larger than `max_bytes` when unpacked.
     """
     try:
         return variables_of_mat(path.read_bytes(), path.name, max_bytes)
@@ -219,7 +219,7 @@ def read_mat(path: Path, max_bytes: int = MAX_BYTES) -> dict[str, Any]:
 def table_from_mat(path: Path, max_bytes: int = MAX_BYTES) -> Table:
     """The variables of a MATLAB file of any version."""
     with path.open("rb") as file:
-        is_hdf5 = b"\x89HDF\r\n\x1a\n" in file.read(1024)  # MATLAB 7.3 puts 512 bytes in front
+        is_hdf5 = b"\x89HDF\r\n\x1a\n" in file.read(1024)  # MATLAB 7.3 begins with 512 bytes of its own
     values = _read_hdf5(path, max_bytes) if is_hdf5 else read_mat(path, max_bytes)
     columns = dict(_flat(values))
     clocks = {
@@ -229,7 +229,7 @@ def table_from_mat(path: Path, max_bytes: int = MAX_BYTES) -> Table:
 
 
 def _timetables(values: Mapping[str, Any], prefix: str = "") -> list[str]:
-    """Beginnings of the names of columns that stand in timetables."""
+    """Prefixes of the names of columns in timetables."""
     found: list[str] = []
     for key, value in values.items():
         if isinstance(value, Timetable):
@@ -255,11 +255,11 @@ def _objects(values: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str
 
 
 DEEPEST_GROUP = 50
-"""Groups of an HDF5 file within one another."""
+"""Largest depth of nested groups in an HDF5 file."""
 
 
 def _read_hdf5(path: Path, max_bytes: int) -> dict[str, Any]:
-    """The data sets of the file itself: links to other places or files are not followed."""
+    """The data sets of the file itself; links to other places or files are not followed."""
     h5py = optional("h5py", f"Reading {path.name}, a MATLAB file of version 7.3,")
     seen: set[int] = set()
     size = 0
@@ -270,7 +270,7 @@ def _read_hdf5(path: Path, max_bytes: int) -> dict[str, Any]:
             raise InputError(
                 f"{path.name} keeps {item.name!r} in another file, which is not read; store it in one file."
             )
-        # A size that is claimed costs nothing in the file, and so does that of a block to unpack.
+        # A small file can claim any size, also for a block to unpack.
         blocks = item.dtype.itemsize * math.prod(item.chunks or ())
         check_size(path.name, blocks, max_bytes)
         size += item.dtype.itemsize * math.prod(item.shape)
@@ -290,7 +290,7 @@ def _read_hdf5(path: Path, max_bytes: int) -> dict[str, Any]:
             if address in seen:
                 raise ValueError(f"{item.name!r} stands in two places")
             seen.add(address)
-            if "MATLAB_object_decode" in item.attrs:  # numbers that lead to the object's insides
+            if "MATLAB_object_decode" in item.attrs:  # numbers that refer to the contents of an object
                 found[name] = MatlabObject(np.bytes_(item.attrs.get("MATLAB_class", b"object")).decode())
             elif isinstance(item, h5py.Group):
                 found[name] = values(item, depth + 1)
@@ -314,9 +314,9 @@ def _read_hdf5(path: Path, max_bytes: int) -> dict[str, Any]:
 
 
 def _flat(values: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Shaped[np.ndarray, " N"]]]:
-    """Nested variables with dotted names, matrices as columns; what is no array is left out.
+    """Nested variables with dotted names, matrices as columns; values that are no arrays are left out.
 
-    The columns of a matrix that is too short to hold signals, but long enough across, are its rows.
+    A matrix with too few rows for a recording, but enough columns, has its signals in its rows.
     """
     found: list[tuple[str, Shaped[np.ndarray, " N"]]] = []
     for key, value in values.items():
@@ -327,14 +327,14 @@ def _flat(values: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Shaped
         if isinstance(value, MatlabObject):
             continue
         parts = _parts(value)
-        if parts is not None:  # an array of structures or of cells, each with leaves of its own
+        if parts is not None:  # an array of structures or cells with values inside
             found += _flat(parts, name)
             continue
         try:
             array = np.asarray(value)
         except ValueError:  # cells of different length
             continue
-        if name.startswith("__") or array.dtype.kind == "V":  # of the file itself, or not decoded
+        if name.startswith("__") or array.dtype.kind == "V":  # header of the file, or not decoded
             continue
         if array.ndim == 2 and array.size and 1 not in array.shape:
             if array.shape[0] < SHORTEST_RECORDING <= array.shape[1]:  # Simulink's "To File" writes rows
@@ -366,7 +366,7 @@ def table_from_npz(path: Path, max_bytes: int = MAX_BYTES) -> Table:
     try:
         with zipfile.ZipFile(path) as archive:
             parts = [part for part in archive.infolist() if part.filename.endswith(".npy")]
-            # Before anything is unpacked; a part that is larger than it says fails its checksum.
+            # Before anything is unpacked; a part larger than its stated size fails its checksum.
             check_size(path.name, sum(part.file_size for part in parts), max_bytes)
             names = distinct([part.filename.removesuffix(".npy") for part in parts], path.name)
             arrays = {
@@ -380,7 +380,7 @@ def table_from_npz(path: Path, max_bytes: int = MAX_BYTES) -> Table:
 
 
 def _npy(data: bytes, label: str) -> np.ndarray:
-    """The array in the content of an NPY file, of the size that its header says."""
+    """The array in the content of an NPY file, whose size must agree with its header."""
     file = BytesIO(data)
     version = np.lib.format.read_magic(file)
     headers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
@@ -410,12 +410,12 @@ def table_from_parquet(path: Path, max_bytes: int = MAX_BYTES) -> Table:
     parquet: Any = optional("pyarrow.parquet", f"Reading {path.name}")
     try:
         columns = columns_of_parquet(path)
-        # Equal values, stored once, are counted as often as they are unpacked.
+        # Equal values are stored once, but counted as often as they are unpacked.
         check_size(path.name, sum(column.size for column in columns), max_bytes)
         # Text stays a list of words with a number for each row.
         texts = [column.name for column in columns if column.is_text]
         table = parquet.read_table(path, partitioning=None, read_dictionary=texts)
-        frame = table.to_pandas(ignore_metadata=True)  # which may turn words into text of every row
+        frame = table.to_pandas(ignore_metadata=True)  # else it may expand words to text in every row
         return table_from_frame(frame, path.name)
     except InputError:
         raise

@@ -1,4 +1,4 @@
-"""Columns of a table as signals in SI units: angles from degrees or counts, times, what the header says."""
+"""Columns of a table as signals in SI units: angles from degrees or counts, times, units in the header."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -14,13 +14,13 @@ from rotflex_jax.recording.quality import SLOWEST_SAMPLING, Finding, whole_numbe
 from rotflex_jax.recording.samples import even_spacing, finite, real_numbers, sampling_period
 
 OTHER_NAMES = {"t": ("time",), "theta": ("θ",), "alpha": ("α",)}
-"""What the columns of the joint may be called as well."""
+"""Other accepted names of the columns of the joint."""
 
 JOINT_SENSORS = ("theta", "alpha", "speed")
-"""Columns that a joint may have as sensors."""
+"""Columns of possible sensors of the joint."""
 
 TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6}
-"""Unit of a time -> seconds."""
+"""Unit of time -> its length in seconds."""
 
 TIME_WORDS = {
     "sec": "s",
@@ -31,7 +31,7 @@ TIME_WORDS = {
     "µs": "us",
     "μs": "us",
 }
-"""Other ways to write them."""
+"""Other spellings of units of time."""
 
 ANGLE_UNITS = {
     "rad": {"rad", "rads", "radian", "radians"},
@@ -40,7 +40,7 @@ ANGLE_UNITS = {
 
 
 def unused_sensors(table: Table, channels: Sequence[str], used: set[str]) -> list[Finding]:
-    """What is said of sensors of a joint that the file has too, where one alone is read."""
+    """Finding on further sensors of a joint in the file, if only one sensor is read."""
     if len(channels) != 1 or channels[0] not in JOINT_SENSORS:
         return []
     there = {c: table.find(c, *OTHER_NAMES.get(c, ())) for c in JOINT_SENSORS}
@@ -57,7 +57,7 @@ def unused_sensors(table: Table, channels: Sequence[str], used: set[str]) -> lis
 
 
 def named_outputs(outputs: Any) -> dict[str, str]:
-    """Channel name to column name."""
+    """Channel name -> column name."""
     if outputs is None:
         return {"theta": "theta", "alpha": "alpha"}
     chosen: dict[str, Any]
@@ -75,7 +75,7 @@ def named_outputs(outputs: Any) -> dict[str, str]:
 
 
 def named_signals(signals: Any, table: Table) -> dict[str, str]:
-    """Signal name to column name; of a column alone, the signal has the name, with the unit behind."""
+    """Signal name -> column name; a signal without a given name has the name of its column, with the unit."""
     if isinstance(signals, Mapping):
         columns, names = list(signals.values()), list(signals)
     else:
@@ -93,7 +93,7 @@ def named_signals(signals: Any, table: Table) -> dict[str, str]:
 
 
 def _with_unit(table: Table, column: str) -> str:
-    """Its name with its unit in brackets, where the file says one."""
+    """Name of a column with its unit in brackets, if the file has a unit for it."""
     name, unit = name_and_unit(column)[0], _unit(table, column)
     return f"{name} [{unit}]" if unit else name
 
@@ -106,10 +106,10 @@ def column_of(table: Table, name: str, argument: str, wrong: Mapping[str, str]) 
     """A column as finite numbers.
 
     Args:
-        table: Where it stands.
-        name: Of the column.
-        argument: What names it, for messages.
-        wrong: Units that it must not have -> the one that is needed.
+        table: Table with the column.
+        name: Name of the column.
+        argument: Argument of the user that names the column, for messages.
+        wrong: Unit that the column must not have -> the unit that is needed.
     """
     values = table.column(name, argument)
     label = f"{table.label}: column {name!r}"
@@ -125,12 +125,12 @@ def column_of(table: Table, name: str, argument: str, wrong: Mapping[str, str]) 
 
 
 def _words(table: Table, name: str) -> set[str]:
-    """The words of a name and of its unit, in small letters."""
+    """The words of a name and of its unit, in lower case."""
     return set(re.split(r"[^a-z°]+", f"{name} {table.units.get(name, '')}".lower()))
 
 
 def _as_written(table: Table, name: str, word: str) -> str:
-    """A word of a name or of its unit with its capitals."""
+    """A word of a name or of its unit in its original spelling."""
     said = re.search(rf"(?<![a-z°]){re.escape(word)}(?![a-z°])", f"{name} {table.units.get(name, '')}", re.I)
     return said[0] if said else word
 
@@ -141,7 +141,7 @@ def _unit_source(name: str, unit: str) -> str:
 
 
 def input_unit(table: Table, name: str) -> str | None:
-    """The unit of the input where the file says that it is another than volts."""
+    """The unit of the input, if the file has a unit other than volts for it."""
     unit = _unit(table, name)
     if not unit and "current" in _words(table, name):
         return "A"
@@ -149,7 +149,7 @@ def input_unit(table: Table, name: str) -> str | None:
 
 
 def counts_per_turn(counts: Any, channels: Sequence[str], degrees: bool) -> dict[str, float]:
-    """Channel -> counts of one turn."""
+    """Channel -> counts per turn."""
     if counts is None:
         return {}
     each: dict[str, Any] = dict(counts) if isinstance(counts, Mapping) else dict.fromkeys(channels, counts)
@@ -181,16 +181,16 @@ def angle(
     counts: float | None,
     accepted: Sequence[str],
 ) -> Real[np.ndarray, " N"]:
-    """An output in radians: from counts, from degrees, or as it is."""
+    """An output in radians: converted from counts or degrees, or unchanged."""
     if counts is not None:
         return values * (2 * np.pi / counts)
     behind = set(re.split(r"[^a-z°]+", name_and_unit(name)[1].lower()))
-    if behind & ANGLE_UNITS["deg"]:  # the header says so, right behind the name
+    if behind & ANGLE_UNITS["deg"]:  # the header has the unit right after the name
         degrees = True
     else:
         _check_angle_unit(table, name, degrees)
     if degrees and whole_numbers(values) and "units" not in accepted:
-        # Of a joint, in degrees: no encoder is so coarse, and no arm bends so far.
+        # In degrees, no encoder of a joint would be so coarse, and no arm would deflect so far.
         most = 90.0 if channel == "alpha" else 1000.0
         if np.ptp(values) > most:
             raise InputError(
@@ -202,7 +202,7 @@ def angle(
 
 
 def deflection(y: dict[str, Real[np.ndarray, " N"]]) -> dict[str, Real[np.ndarray, " N"]]:
-    """The arm's angle in the room as its deflection from the hub."""
+    """The outputs with the absolute angle of the arm converted to its deflection relative to the hub."""
     if not {"theta", "alpha"} <= set(y):
         raise InputError(
             f"Argument arm_absolute=True needs the channels theta and alpha, but the outputs are "

@@ -1,15 +1,15 @@
 """Public recordings, downloaded on request, and public benchmarks with their official protocol.
 
-None comes with the package: most have no licence that would allow it. A local folder, in the argument
-`folder` or the environment variable ROTFLEX_DATA, replaces the network.
+No public recording is part of the package: most have no licence that would allow it. A local folder, given by
+the argument `folder` or the environment variable ROTFLEX_DATA, replaces the download.
 
     benchmark = rf.data.benchmark("emps")
     result = rf.discover(rf.joints.emps(), *benchmark.train.split(0.7))
     benchmark.score(result.model)
 
-The tests are free runs, the first state comes from the first `n_init` samples, and the error is the root
-mean square of what follows. Published results are listed, each as its source has it: baselines, not the best
-that there is. A result is left out where it is not sure that the test was unseen.
+The tests are free runs: the first state comes from the first `n_init` samples, and the error is the root mean
+square over the samples after these. Published results are listed as in their sources; they are baselines, not
+the best known results. A result is left out if it is not certain that the test data were unseen.
 """
 
 import hashlib
@@ -46,20 +46,20 @@ def list_datasets() -> tuple[PublicDataset, ...]:
 def fetch(name: str, folder: str | os.PathLike[str] | None = None) -> list[Path]:
     """The files of a data set: from a folder if one is given, else downloaded once into a cache.
 
-    The hash of every file is checked, wherever it comes from. A file of the folder may be packed by gzip,
-    as `NAME.gz`; its hash is that of what is in it.
+    The hash of every file is checked, wherever the file comes from. A file of the folder may be packed by
+    gzip, as `NAME.gz`; the hash is then that of its content.
 
     Args:
-        name: of the data set.
-        folder: local folder with one subfolder per data set; the environment variable
+        name: name of the data set.
+        folder: local folder with one subfolder for each data set; the environment variable
             ROTFLEX_DATA, if set, is the default.
 
     Returns:
         Paths of the files, in the order of the data set.
 
     Raises:
-        InputError: no such data set, one that is fetched by hand, a file missing in the folder, no
-            network, or another hash.
+        InputError: the data set does not exist or has to be fetched by hand, a file is missing in the folder,
+            there is no network, or a file has another hash.
     """
     if name in BY_HAND:
         raise InputError(f"The data set {name!r} is not downloaded here; {BY_HAND[name].advice}.")
@@ -74,14 +74,14 @@ def load_dataset(name: str, folder: str | os.PathLike[str] | None = None) -> lis
     """The recordings of a data set.
 
     Args:
-        name: of the data set.
+        name: name of the data set.
         folder: see `fetch`.
 
     Returns:
-        Its recordings, in the order of its files.
+        The recordings, in the order of the files.
 
     Raises:
-        InputError: as `fetch`, and as `Recording`.
+        InputError: as in `fetch` and in `Recording`.
     """
     recordings: list[Recording] = []
     paths = fetch(name, folder)
@@ -94,13 +94,13 @@ def load_dataset(name: str, folder: str | os.PathLike[str] | None = None) -> lis
 
 
 def demo_recording() -> Recording:
-    """A synthetic recording that comes with the package: a joint with two effects that the model lacks."""
+    """A synthetic recording in the package, of a joint with two effects that the default model lacks."""
     with as_file(files("rotflex_jax.data") / "demo.csv") as path:
         return load(path)
 
 
 def find(file: PublicFile, folder: Path) -> Path | None:
-    """Where a folder of recordings has the file, plain or packed by gzip; None where it has not."""
+    """Path of a file in a folder of recordings, plain or packed by gzip; None if it is not there."""
     path = folder / file.name
     return next((p for p in (path, path.with_name(f"{path.name}.gz")) if p.is_file()), None)
 
@@ -132,7 +132,7 @@ def _download(file: PublicFile) -> Path:
                 path=pooch.os_cache("rotflex_jax"),
             )
         )
-    except ValueError as error:  # what arrived has another hash, and was thrown away
+    except ValueError as error:  # the downloaded file has another hash, and was deleted
         raise InputError(
             f"What is at {file.address} is no longer the public file {file.name} (another "
             "SHA-256); get it from a colleague and name its folder."
@@ -152,7 +152,7 @@ class Simulates(Protocol):
     """A model that can be scored."""
 
     def simulate(self, recording: Recording) -> Real[np.ndarray, "N C"]:
-        """Free run."""
+        """Outputs of a free run over the recording."""
         ...
 
 
@@ -161,9 +161,9 @@ class Published:
     """A published result.
 
     Args:
-        method: of identification.
-        errors: name of the test to error, in the unit of the benchmark.
-        source: where it is published.
+        method: method of identification.
+        errors: name of the test -> error, in the unit of the benchmark.
+        source: publication of the result.
     """
 
     method: str
@@ -177,8 +177,8 @@ class Constant:
 
     Args:
         parameter: full name in the ready-made mechanism.
-        value: in the unit of the parameter.
-        about: what it is, with unit.
+        value: value in the unit of the parameter.
+        about: description, with unit.
     """
 
     parameter: str
@@ -191,14 +191,14 @@ class Benchmark:
     """A data set with its protocol.
 
     Args:
-        name: of the data set.
-        train: for training and validation; split it as you like.
-        tests: name to test recording, `n_init` set.
-        unit: of the errors.
-        factor: errors in that unit per unit of the channel.
-        published: results.
+        name: name of the data set.
+        train: recording for training and validation; split it as you like.
+        tests: name -> test recording, with the official `n_init`.
+        unit: unit of the errors.
+        factor: factor from the unit of the channel to the unit of the errors.
+        published: published results.
         constants: published parameters of the machine.
-        source: who made the data.
+        source: authors of the data.
     """
 
     name: str
@@ -211,10 +211,10 @@ class Benchmark:
     source: str
 
     def score(self, model: Simulates) -> dict[str, float]:
-        """Official errors of a model: test to root mean square error of its free run [`unit`].
+        """Official errors of a model: test -> root mean square error of its free run [`unit`].
 
         Args:
-            model: fitted to `train` and to nothing else.
+            model: model that was fitted to `train` alone.
         """
         return {name: self.error(name, model.simulate(test)) for name, test in self.tests.items()}
 
@@ -232,19 +232,19 @@ class Benchmark:
         return self.factor * rmse(recording, modelled)[recording.channels[0]]
 
     def best(self, test: str) -> float:
-        """Least of the published errors that are listed here [`unit`]; others may have published less."""
+        """Least of the published errors that are listed here [`unit`]; there may be lower ones elsewhere."""
         return min(p.errors[test] for p in self.published if test in p.errors)
 
 
 def benchmark(name: str, folder: str | os.PathLike[str] | None = None) -> Benchmark:
-    """A public benchmark, its recordings fetched or taken from a folder.
+    """A public benchmark; its recordings are downloaded or taken from a folder.
 
     Args:
         name: "emps" or "silverbox".
         folder: as in `fetch`.
 
     Raises:
-        InputError: no such benchmark, or as `fetch`.
+        InputError: the benchmark does not exist, or as in `fetch`.
     """
     if name not in _MAKERS:
         raise InputError(f"There is no benchmark {name!r}; choose one of {', '.join(_MAKERS)}.")

@@ -1,10 +1,10 @@
 """Input signals: noise, multisine, pseudo-random binary, steps, sweep, pulse.
 
-Filtered noise is the best single choice where nothing is known. Steps show effects of the position, a sweep
-or a multisine shows play, a binary signal shows delays and further modes; but two levels never show a dead
-zone or a saturation.
+Filtered noise is the best single choice if nothing is known about the machine. Steps show effects of the
+position, a sweep or a multisine shows play, and a binary signal shows delays and further modes. A signal with
+two levels never shows a dead zone or a saturation.
 
-Every input is an array of N voltages [V] at the sampling period Ts [s], the same for the same seed,
+Every input is an array of N voltages [V] at the sampling period Ts [s]. It is the same for the same seed,
 which is an integer or a NumPy generator. An argument out of range raises `InputError`.
 """
 
@@ -36,11 +36,11 @@ def noise(N: int, Ts: float, *, rms: float = 1.0, bandwidth: float = 5.0, seed: 
     u[k] = a u[k-1] + sqrt(1 - a^2) w[k],  a = exp(-2 pi bandwidth Ts),  w ~ N(0, rms^2)
 
     Args:
-        N: samples.
+        N: number of samples.
         Ts: sampling period [s].
         rms: root mean square of the process [V].
         bandwidth: corner frequency [Hz].
-        seed: of the random numbers.
+        seed: seed of the random numbers.
 
     >>> noise(3, 0.002, seed=1)
     array([0.34558419, 0.60687965, 0.68347299])
@@ -69,17 +69,17 @@ def multisine(
 
     u[k] = A sum_h cos(2 pi h k / P + phase_h),  P = N / periods,  A = rms sqrt(2 / harmonics)
 
-    Phases are random; repeatedly clipping the signal and taking the phases of the clipped one lowers the
-    peak, so that the same power fits within the amplifier.
+    The phases are random at first. To lower the peak, the signal is repeatedly clipped and the phases of the
+    clipped signal are taken, so that the same power fits within the range of the amplifier.
 
     Args:
-        N: samples, a multiple of `periods`.
+        N: number of samples, a multiple of `periods`.
         Ts: sampling period [s].
         band: lowest and highest frequency [Hz].
         rms: root mean square over a period, exactly [V].
-        periods: how often the signal repeats.
+        periods: number of periods.
         optimise_crest: whether to lower the peak; otherwise the phases stay random.
-        seed: of the phases.
+        seed: seed of the phases.
 
     Source:
         van der Ouderaa, Schoukens, Renneboog 1988, time-frequency domain swapping.
@@ -121,16 +121,17 @@ def multisine(
 
 
 def prbs(N: int, Ts: float, *, amplitude: float = 1.0, hold: float = 0.05, seed: Seed = 0) -> Voltage:
-    """A maximum-length pseudo-random binary sequence: two levels, each bit held for a while.
+    """A maximum-length pseudo-random binary sequence: two levels, each bit held for a fixed time.
 
-    As long as needed not to repeat. Not for a dead zone or a saturation: two levels do not show them.
+    The sequence is long enough not to repeat. Not for a dead zone or a saturation: two levels do not show
+    them.
 
     Args:
-        N: samples.
+        N: number of samples.
         Ts: sampling period [s].
         amplitude: the levels are plus and minus this [V].
-        hold: time of one bit [s], rounded to whole samples.
-        seed: of the bit to start from.
+        hold: duration of one bit [s], rounded to whole samples.
+        seed: seed of the bit at which the sequence starts.
 
     >>> prbs(6, 0.01, amplitude=2.0, hold=0.02)
     array([-2., -2.,  2.,  2.,  2.,  2.])
@@ -154,16 +155,16 @@ def steps(
     hold: tuple[float, float] = (0.15, 0.8),
     seed: Seed = 0,
 ) -> Voltage:
-    """Random levels, each held for a random time, both uniform.
+    """Random levels, each held for a random time, both uniformly distributed.
 
-    Not for play in the gears or a sensor bias, which steps do not show.
+    Not for play in the gear or a sensor bias, which steps do not show.
 
     Args:
-        N: samples.
+        N: number of samples.
         Ts: sampling period [s].
         amplitude: the levels lie within plus and minus this [V].
-        hold: shortest and longest time of a level [s].
-        seed: of the random numbers.
+        hold: shortest and longest duration of a level [s].
+        seed: seed of the random numbers.
 
     >>> np.unique(steps(50, 0.01, hold=(0.1, 0.1))).size
     5
@@ -179,15 +180,15 @@ def steps(
 
 
 def sweep(N: int, Ts: float, *, band: tuple[float, float] = (0.1, 12.0), amplitude: float = 1.0) -> Voltage:
-    """A sine whose frequency rises exponentially, the same time for every octave.
+    """A sine whose frequency rises exponentially, with the same time for every octave.
 
     u(t) = A sin(2 pi f0 T (r^(t / T) - 1) / ln(r)),  r = f1 / f0,  T = N Ts
 
     Args:
-        N: samples.
+        N: number of samples.
         Ts: sampling period [s].
         band: first and last frequency [Hz].
-        amplitude: of the sine [V].
+        amplitude: amplitude of the sine [V].
 
     >>> round(float(np.max(sweep(1000, 0.01, amplitude=3.0))), 2)
     3.0
@@ -202,14 +203,14 @@ def sweep(N: int, Ts: float, *, band: tuple[float, float] = (0.1, 12.0), amplitu
 
 
 def pulse(N: int, Ts: float, *, amplitude: float = 1.0, width: float = 0.5, delay: float = 0.1) -> Voltage:
-    """One rectangular pulse, nothing before and after: the free motion afterwards shows friction.
+    """One rectangular pulse, with zero before and after it: the free motion afterwards shows friction.
 
     Args:
-        N: samples.
+        N: number of samples.
         Ts: sampling period [s].
         amplitude: height, of either sign [V].
-        width: how long it lasts [s].
-        delay: when it starts [s].
+        width: duration of the pulse [s].
+        delay: start of the pulse [s].
 
     >>> pulse(5, 0.1, amplitude=3.0, width=0.2, delay=0.1)
     array([0., 3., 3., 0., 0.])
@@ -232,7 +233,7 @@ def pulse(N: int, Ts: float, *, amplitude: float = 1.0, width: float = 0.5, dela
 INPUTS: dict[str, Callable[..., Voltage]] = {
     kind.__name__: kind for kind in (noise, multisine, prbs, steps, sweep, pulse)
 }
-"""Every kind of input by name."""
+"""Name -> function of each kind of input."""
 
 
 def _check_grid(N: int, Ts: float) -> None:

@@ -1,4 +1,4 @@
-"""Recordings from files and DataFrames, and back into text."""
+"""Recordings from files and DataFrames, and their export as text."""
 
 import csv
 import os
@@ -65,24 +65,25 @@ READERS: dict[str, Callable[[Path, int], Table]] = {
     ".mcap": table_from_mcap,
     ".json": table_from_json,
 }
-# In a folder of recordings JSON files hold settings and results: one is read where it is named itself.
+# In a folder of recordings, JSON files contain settings and results: they are read only if named directly.
 FILES_OF_CHANNELS = tuple(ending for ending in READERS if ending != ".json")
 
 
 def read_table(source: Any, max_bytes: int = MAX_BYTES, time: str | None = None) -> Table:
-    """Reads a file by its ending, files with one channel each, or takes a DataFrame.
+    """Reads a file according to its ending, or files with one channel each, or takes a DataFrame.
 
     Args:
-        source: path of a file, several, or that of a folder with one file for each channel; or a pandas
+        source: path of a file, several paths, or path of a folder with one file for each channel; or a pandas
             DataFrame.
-        max_bytes: largest size of a file, and of what it unpacks to [bytes].
-        time: column of the time in each of several files, where it has another name than `t` or `time`.
+        max_bytes: largest size of a file, packed and unpacked [bytes].
+        time: column of the time in each of several files, if its name is not `t` or `time`.
 
     Returns:
         The table.
 
     Raises:
-        InputError: no such file, nothing in it, unknown ending, too large, or not what the ending says.
+        InputError: the file does not exist, is empty, has an unknown ending, is too large, or does not have
+            the format of its ending.
     """
     if hasattr(source, "columns") and hasattr(source, "to_numpy"):
         return table_from_frame(source)
@@ -113,9 +114,10 @@ def read_table(source: Any, max_bytes: int = MAX_BYTES, time: str | None = None)
 
 
 def _together(sources: Sequence[Any], label: str, max_bytes: int, time: str | None) -> Table:
-    """One table of files with a channel or more each.
+    """One table from files with one or more channels each.
 
-    Channels have the names of the columns; where two are equal, those of the files that have one each.
+    Channels have the names of the columns. If two names are equal, a file with a single channel gives the
+    channel its own name.
     """
     if not sources:
         raise InputError(
@@ -156,10 +158,10 @@ def _together(sources: Sequence[Any], label: str, max_bytes: int, time: str | No
 
 
 def readable_file(source: Any) -> Path:
-    """The path of a file that is there, readable and not empty.
+    """The path of a file that exists, is readable and is not empty.
 
     Raises:
-        InputError: it is not.
+        InputError: the file is not so.
     """
     if not isinstance(source, str | os.PathLike):
         raise InputError(
@@ -169,7 +171,7 @@ def readable_file(source: Any) -> Path:
     path = Path(source)
     try:
         status = path.stat()
-    except (OSError, ValueError) as error:  # a name that is too long or a circle of links is none either
+    except (OSError, ValueError) as error:  # also for a name that is too long, or for a loop of links
         missing = isinstance(error, FileNotFoundError | NotADirectoryError)
         reason = "" if missing else f" ({getattr(error, 'strerror', None) or error})"
         there = "may not be read" if isinstance(error, PermissionError) else "does not exist"
@@ -186,7 +188,7 @@ def readable_file(source: Any) -> Path:
 
 
 def _check_options(words: Mapping[str, Any], choices: Mapping[str, Any], units: Any, resample: Any) -> None:
-    """Refuses options of `load` that are no words, no choices, no units by name and no period."""
+    """Refuses options of `load` that do not have the right type."""
     for name, word in words.items():
         example = {"input": "voltage", "time": "t"}.get(name, "ms")
         if not (word is None or isinstance(word, str)):
@@ -223,15 +225,15 @@ def load(
     resample: float | str | None = None,
     signals: str | Sequence[str] | Mapping[str, str] | None = None,
 ) -> Recording:
-    """Reads a recording and checks it; nothing is repaired unless it is asked for by name.
+    """Reads a recording and checks it; nothing is repaired unless an argument asks for it.
 
-    Text (.csv, .tsv, .txt; any delimiter), JSON, MATLAB (.mat of any version), NumPy (.npz), Parquet,
-    spreadsheets (.xlsx), LabVIEW (.tdms), MDF4 (.mf4), ROS 2 (.mcap), or a pandas DataFrame; a folder or a
-    list of files with one channel each is one recording. Columns `t,voltage,theta,alpha` in seconds,
-    volts and radians unless other names are given; capitals and a unit behind the name, as in
-    `Theta [deg]`, are understood. In .mat and .npz, a matrix `log` gives the columns `log[0]`, `log[1]`,
-    and a structure `log` with a field `u` the column `log.u`. An object that has `u`, `y` and
-    `sampling_time`, such as those of `nonlinear_benchmarks`, is taken as it is, with the channels named in
+    Formats are text (.csv, .tsv, .txt; any delimiter), JSON, MATLAB (.mat of any version), NumPy (.npz),
+    Parquet, spreadsheets (.xlsx), LabVIEW (.tdms), MDF4 (.mf4), ROS 2 (.mcap), and pandas DataFrames. A
+    folder or a list of files with one channel each is one recording. The default columns are
+    `t,voltage,theta,alpha` in seconds, volts and radians. Capital letters and a unit after the name, as in
+    `Theta [deg]`, are understood. In .mat and .npz, a matrix `log` gives the columns `log[0]`, `log[1]`, and
+    a structure `log` with a field `u` gives the column `log.u`. An object that has `u`, `y` and
+    `sampling_time`, such as those of `nonlinear_benchmarks`, is taken unchanged, with the channel names in
     `outputs`.
 
     Args:
@@ -240,27 +242,28 @@ def load(
         input: column of the motor voltage [V].
         outputs: columns of theta, then of alpha [rad]; or a mapping of channel name to column.
         degrees: whether the outputs are in degrees.
-        Ts: sampling period [s], where no column has the time.
+        Ts: sampling period [s], if no column has the time.
         time: column of the time [s].
         accept: faults to accept by name, such as `saturated`; see `Recording`.
-        units: channel to unit, where it is not rad; the column of the input to its unit, where that is not V.
-        max_bytes: largest size of the file, and of what it unpacks to [bytes].
-        counts: counts of one turn, where the outputs are the counts of an encoder; or a mapping of channel to
-            counts, the others being angles.
-        arm_absolute: whether alpha is the angle of the arm in the room, from which theta is then subtracted.
-        time_unit: of the time, "s", "ms" or "us"; what the header says, else seconds.
-        resample: sampling period to have [s], or "auto" for the usual one, where times are uneven, or signals
-            have times of their own: the
-            input and `signals` are held, outputs follow straight lines, and a finding says what was done.
-        signals: columns of what was measured of all else that acts on the machine, such as the acceleration
-            of what it stands on, see `Recording`; or a mapping of signal name to column. They are taken in
-            the unit that they have.
+        units: mapping of channel to unit, for units other than rad; and of the column of the input to its
+            unit, if that is not V.
+        max_bytes: largest size of the file, packed and unpacked [bytes].
+        counts: counts per turn, if the outputs are counts of an encoder; or a mapping of channel to counts
+            per turn, where the other channels are angles.
+        arm_absolute: whether alpha is the absolute angle of the arm, from which theta is then subtracted.
+        time_unit: unit of the time, "s", "ms" or "us"; by default the unit in the header, else seconds.
+        resample: new sampling period [s], or "auto" for the median step, for uneven times or for signals with
+            times of their own. The input and `signals` are held, outputs are interpolated linearly, and a
+            finding states what was done.
+        signals: columns of measured quantities other than the input that act on the machine, such as the
+            acceleration of the base, see `Recording`; or a mapping of signal name to column. Their units are
+            kept.
 
     Returns:
         The recording.
 
     Raises:
-        InputError: the file or its data are unusable; the message says what to do.
+        InputError: the file or its data are unusable; the message states what to do.
 
     >>> import pandas as pd
     >>> k = np.arange(100)
@@ -314,7 +317,7 @@ def load(
     clock = table.find(time or "t", *(() if time else OTHER_NAMES["t"]))
     names = [u_name, *acting.values(), *chosen.values()]
     own = list(dict.fromkeys(clock for name, clock in table.clocks.items() if name in names))
-    if own and clock not in table.columns:  # the file says what times a signal has
+    if own and clock not in table.columns:  # the file assigns times to each signal
         clock = own[0]
     apart = len(own) > 1 and any(not np.array_equal(table.columns[c], table.columns[own[0]]) for c in own)
     stamps = [] if Ts is not None and time is None else [(clock, "time=")]
@@ -382,7 +385,7 @@ def load(
         start, period, steps, together, told = resampled(t, np.column_stack(held), together, resample, *at)
         held = list(steps.T)
         remarks.append(told)
-    # Whoever says the unit of the time means a long period; a column of it has been checked above.
+    # A user who gives the unit of the time means a long period; a column of times has been checked above.
     seconds = period >= SLOWEST_SAMPLING and (time_unit is not None or "units" in accepted)
     try:
         other = (units or {}).get(u_name) or input_unit(table, u_name)
@@ -403,32 +406,32 @@ def load(
     except InputError as error:
         raise InputError(f"{table.label}: {error}") from error
     for finding in recording.findings:
-        # Arrays come from a program that knows what they are; the columns of a file are less certain.
+        # Columns of a file are less certain than arrays, whose meaning the calling program knows.
         if finding.kind in DOUBTED and finding.kind not in accepted:
             told = converted(finding) if finding.channel in in_radians else finding
             raise InputError(f"{table.label}: {told.message}")
-    if table.cut:  # said of the file, not of parts of the recording
+    if table.cut:  # a finding on the file, not on parts of the recording
         cut = Finding("cut", [*table.columns][-1], table.cut, "note")
         vars(recording)["findings"] = (*recording.findings, cut)
     return recording
 
 
 def save_csv(recording: Recording, path: str | os.PathLike[str]) -> Path:
-    """Writes a recording as text that `load` reads: time, input, outputs, and its signals under their names.
+    """Writes a recording as text that `load` reads: time, input, outputs and signals, with their names.
 
     Args:
-        recording: what to write.
-        path: of the file, which is replaced if it exists.
+        recording: recording to write.
+        path: path of the file, which is replaced if it exists.
 
     Returns:
         The path.
 
     Raises:
-        InputError: it cannot be written; an old file stays.
+        InputError: the file cannot be written; an existing file then stays as it is.
     """
     recording = single(recording, "recording")
     columns = np.column_stack([recording.t, recording.u, recording.y, *recording.signals.values()])
-    # 17 digits carry a number exactly; the time is known to fewer.
+    # 17 digits represent a number exactly; the time is known to fewer digits.
     formats = ["%.15g"] + ["%.17g"] * (columns.shape[1] - 1)
     header = ["t", recording.input_name, *recording.channels, *recording.signals]
     csv.writer(text := StringIO(), lineterminator="\n").writerow(header)

@@ -1,7 +1,7 @@
-"""Recordings that objects of other packages hold.
+"""Recordings in objects of other packages.
 
-They are recognised by their attributes `u`, `y`, `sampling_time`, and if present
-`state_initialization_window_length` and `name`; those packages are not imported.
+Such an object is recognised by its attributes `u` and `y`. Its attributes `sampling_time`,
+`state_initialization_window_length` and `name` are used if present. The other packages are not imported.
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,7 +17,7 @@ FOREIGN_NAMES = {
     "Ts": ("sampling_time", "Ts", "dt"),
     "n_init": ("state_initialization_window_length", "n_init"),
 }
-"""Attribute of a recording -> names that other packages give it."""
+"""Attribute of a recording -> names of this attribute in other packages."""
 
 
 def is_foreign(source: Any) -> bool:
@@ -41,21 +41,21 @@ def from_foreign(
 ) -> Recording:
     """A recording from an object with `u` and `y`.
 
-    Such objects name neither channels nor units, so give them; one output is called `output` otherwise,
-    several `output_1`, `output_2` and so on, without a unit.
+    Such objects have no names of channels and no units, so give them. By default a single output is called
+    `output`, several outputs `output_1`, `output_2` and so on, without a unit.
 
     Args:
         source: the object.
         channels: names of the outputs, in order.
-        units: channel to unit.
-        Ts: sampling period [s], where the object has none.
+        units: channel -> unit.
+        Ts: sampling period [s], if the object has none.
         accept: faults to accept, as in `Recording`.
 
     Returns:
-        The recording; its `n_init` is the object's, if it has one.
+        The recording; its `n_init` is that of the object, if the object has one.
 
     Raises:
-        InputError: no sampling period, or as `Recording`.
+        InputError: there is no sampling period, or as in `Recording`.
 
     >>> from types import SimpleNamespace
     >>> k = np.arange(100)

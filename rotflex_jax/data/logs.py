@@ -1,6 +1,7 @@
 """Logs of LabVIEW (TDMS), of test benches (MDF4) and of ROS 2 (MCAP) as tables; packages are imported on use.
 
-A log keeps each group of signals with times of its own. They become one table whose signals know their times.
+In a log each group of signals has its own times. The groups become one table, which has for each signal the
+name of its column of times.
 """
 
 import contextlib
@@ -19,26 +20,26 @@ from rotflex_jax.data.tables import MAX_BYTES, Table, check_size, unreadable
 from rotflex_jax.errors import InputError, optional
 
 CLOCKS = ("t", "time", "timestamp", "timestamps")
-"""What a channel with the times is called."""
+"""Names of a channel with the times."""
 
 MOST_NUMBERS = 64
-"""Numbers in one message that become columns of their own."""
+"""Largest number of columns from one message."""
 
 DEEPEST_FIELD = 8
-"""Messages within one another."""
+"""Largest depth of nested messages."""
 
 WIDEST_SCALING = 8
-"""Bytes that one byte of a TDMS file may become: 8-bit readings of a converter that are scaled to float64."""
+"""Most unpacked bytes per byte of a TDMS file: 8-bit readings of a converter that are scaled to float64."""
 
 
 class Channel(NamedTuple):
     """A signal of a log.
 
     Attributes:
-        group: that it stands in; its channels have common times.
-        name: of the signal.
-        unit: by the file, empty where it says none.
-        values: one for each time.
+        group: group of the signal, whose channels have common times.
+        name: name of the signal.
+        unit: unit in the file, empty if there is none.
+        values: one value for each time.
     """
 
     group: str
@@ -53,13 +54,13 @@ def table_of_channels(
     clocks: dict[str, Shaped[np.ndarray, " _"]],
     clock: str = "t",
 ) -> Table:
-    """A table with the names of the channels, and their groups before the names where two are equal.
+    """A table with the names of the channels; equal names have the names of their groups in front.
 
     Args:
-        label: what an error calls it.
+        label: name of the table in an error message.
         channels: signals.
-        clocks: group to its times.
-        clock: name of the column with the times, a unit behind it where that is not the second.
+        clocks: group -> its times.
+        clock: name of the column with the times, followed by the unit if that is not the second.
 
     >>> x = np.arange(3.0)
     >>> table = table_of_channels("run", [Channel("a", "u", "V", x), Channel("b", "u", "", x)], {"a": x})
@@ -91,14 +92,14 @@ def table_of_channels(
 
 
 def table_from_tdms(path: Path, max_bytes: int = MAX_BYTES) -> Table:
-    """The channels of a LabVIEW file, times from a channel of that name or the waveform's properties.
+    """The channels of a LabVIEW file; times come from a channel of that name or from waveform properties.
 
     Raises:
         InputError: nptdms is missing, or the file is damaged, too large or without numbers.
     """
     nptdms: Any = optional("nptdms", f"Reading {path.name}")
     try:
-        # A file of ours is closed where nptdms fails.
+        # We open the file ourselves, so that it is closed if nptdms fails.
         with path.open("rb") as opened, nptdms.TdmsFile.open(opened) as file:
             found = [
                 (group.name, channel)
@@ -131,14 +132,14 @@ def table_from_tdms(path: Path, max_bytes: int = MAX_BYTES) -> Table:
 
 
 def _seconds(values: np.ndarray) -> np.ndarray:
-    """Times of day as seconds since the first; other numbers as they are."""
+    """Dates as seconds since the first date; other numbers unchanged."""
     if values.dtype.kind != "M" or not len(values):
         return values
     return (values - values[0]) / np.timedelta64(1, "ns") * 1e-9
 
 
 def table_from_mdf(path: Path, max_bytes: int = MAX_BYTES) -> Table:
-    """The channels of an MDF4 file with numbers, each group with its master as the time.
+    """The numeric channels of an MDF4 file; the master channel of each group is its time.
 
     Samples that the file marks as invalid are missing values.
 
@@ -153,7 +154,7 @@ def table_from_mdf(path: Path, max_bytes: int = MAX_BYTES) -> Table:
         if data[:8] not in (b"MDF     ", b"UnFinMF ") or data[8:10] != b"4.":
             raise ValueError("it does not begin as one of version 4")
         _check_blocks(data)
-        # From memory: asammdf leaves a file open where it fails.
+        # From memory, because asammdf leaves a file open if it fails.
         with contextlib.redirect_stdout(StringIO()), asammdf.MDF(BytesIO(data)) as file:  # it prints errors
             sizes = [
                 group.channel_group.cycles_nr * max(group.channel_group.samples_byte_nr, 1)
@@ -162,7 +163,7 @@ def table_from_mdf(path: Path, max_bytes: int = MAX_BYTES) -> Table:
             check_size(path.name, sum(sizes), max_bytes)
             for number, group in enumerate(file.groups):
                 width = group.channel_group.samples_byte_nr
-                for channel in group.channels:  # which asammdf does not compare
+                for channel in group.channels:  # asammdf does not check this
                     if channel.byte_offset + (channel.bit_offset + channel.bit_count + 7) // 8 > width:
                         raise ValueError(f"the channel {channel.name!r:.40} lies outside its record")
                 name = str(group.channel_group.acq_name or f"group_{number}")
@@ -186,16 +187,16 @@ def table_from_mdf(path: Path, max_bytes: int = MAX_BYTES) -> Table:
 
 
 _CHAINED = (b"##DG", b"##CG", b"##CN", b"##FH", b"##AT", b"##EV", b"##DL", b"##CH")
-"""Blocks of an MDF4 file whose first link leads to the next one of the kind."""
+"""Blocks of an MDF4 file whose first link leads to the next block of the same kind."""
 
 
 def _check_blocks(data: bytes) -> None:
-    """Refuse links between the blocks of an MDF4 file that lead out of it or in a circle.
+    """Refuse links between the blocks of an MDF4 file that lead out of the file or in a circle.
 
-    asammdf follows them without end, or stops in a state that it cannot leave without noise.
+    asammdf follows such links without end, or stops in a state that it cannot leave without error messages.
 
     Raises:
-        ValueError: there is one.
+        ValueError: there is such a link.
 
     Source:
         ASAM MDF 4.1, general block structure: name, reserved, length, number of links, links.
@@ -230,14 +231,14 @@ def _check_blocks(data: bytes) -> None:
 def table_from_mcap(path: Path, max_bytes: int = MAX_BYTES) -> Table:
     """The numbers in the messages of a ROS 2 log, topic by topic.
 
-    A joint of `sensor_msgs/msg/JointState` gives `joint.position`, `joint.velocity` and `joint.effort`; a
-    message with one number has the name of its topic, others `topic.field`, and `topic.field[k]` in a list.
-    The time is that of the headers, or that of the log where none is filled in, in seconds since the first
-    message.
+    A joint of `sensor_msgs/msg/JointState` gives `joint.position`, `joint.velocity` and `joint.effort`. The
+    number of a message with a single number has the name of the topic; other numbers have the names
+    `topic.field`, and `topic.field[k]` in a list. The time is in seconds since the first message. It comes
+    from the headers, or from the log if no header of the topic has a time.
 
     Raises:
-        InputError: mcap or mcap-ros2-support is missing, or the file is damaged, too large, without ROS 2
-            messages with numbers, or a topic changes what it holds.
+        InputError: mcap or mcap-ros2-support is missing; the file is damaged, too large, or has no ROS 2
+            messages with numbers; or the messages of a topic have different numbers.
     """
     readers: Any = optional("mcap.stream_reader", f"Reading {path.name}")
     records: Any = optional("mcap.records", f"Reading {path.name}")
@@ -279,7 +280,7 @@ def table_from_mcap(path: Path, max_bytes: int = MAX_BYTES) -> Table:
         raise
     except Exception as error:  # a damaged file fails in many ways within mcap
         raise unreadable(path, "an MCAP file", error) from error
-    # A header that nobody fills in is zero in all messages, simulated time in the first one alone.
+    # Headers without a time are zero in all messages; simulated time may be zero in the first message alone.
     stamped = {topic: any(stamp for stamp, _ in times) for topic, (times, _) in topics.items()}
     at = {topic: [t[0 if stamped[topic] else 1] for t in times] for topic, (times, _) in topics.items()}
     first = min((times[0] for times in at.values()), default=0)
@@ -301,10 +302,10 @@ def table_from_mcap(path: Path, max_bytes: int = MAX_BYTES) -> Table:
 
 
 def _check_unpacked(chunk: Any) -> None:
-    """Refuse a chunk that unpacks to another size than it says, before it is unpacked.
+    """Refuse a chunk whose unpacked size differs from its stated size, before it is unpacked.
 
     Raises:
-        ValueError: the packed data say another size.
+        ValueError: the packed data state another size.
     """
     if chunk.compression == "zstd":
         said = optional("zstandard", "Reading a packed log").frame_content_size(chunk.data)
@@ -315,7 +316,7 @@ def _check_unpacked(chunk: Any) -> None:
 
 
 def _message(message: Any, topic: str) -> tuple[int, dict[str, float]]:
-    """Time of a message [ns], zero where it has none, and its numbers by name."""
+    """Time of a message [ns], zero if it has none, and its numbers by name."""
     stamp = getattr(getattr(message, "header", None), "stamp", None)
     nanoseconds = 0 if stamp is None else 1_000_000_000 * int(stamp.sec) + int(stamp.nanosec)
     if str(getattr(message, "_type", "")) in ("sensor_msgs/JointState", "sensor_msgs/msg/JointState"):
@@ -334,7 +335,7 @@ def _message(message: Any, topic: str) -> tuple[int, dict[str, float]]:
 
 
 def _numbers(value: Any, name: str, depth: int) -> list[tuple[str, float]]:
-    """The numbers of a message by dotted name, less those of its header and of the layout of a list."""
+    """The numbers of a message by dotted name, without those in its header and in the layout of a list."""
     if isinstance(value, bool | str | bytes) or depth > DEEPEST_FIELD:
         return []
     if isinstance(value, int | float):
@@ -350,7 +351,7 @@ def _numbers(value: Any, name: str, depth: int) -> list[tuple[str, float]]:
 
 
 def _filled(path: Path, channels: list[Channel], clocks: dict[str, Any]) -> Table:
-    """The table, if there is something in it."""
+    """The table of the channels; raises `InputError` if there are none, or if lengths do not agree."""
     if not channels:
         raise InputError(f"{path.name} has no channel with numbers in it; export the recording again.")
     lengths = {group: len(t) for group, t in clocks.items()}

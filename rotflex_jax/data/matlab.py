@@ -1,12 +1,12 @@
-"""MATLAB files up to version 7.2: arrays, timetables, timeseries, tables and what Simulink has logged.
+"""MATLAB files up to version 7.2: arrays, timetables, timeseries, tables and logs of Simulink.
 
-MATLAB keeps the insides of objects apart from the variables, in a part of the file without a name: names,
-then for each object the numbers of its class and of its properties, then the values. Of those objects,
+MATLAB stores the contents of objects apart from the variables, in a part of the file without a name: names,
+then for each object the numbers of its class and of its properties, then the values. Among these objects,
 timetables, timeseries and tables are signals; durations and dates are their times. A Simulink Dataset is an
-object that holds others, each with a name and, at some depth, a timeseries or timetable.
+object that contains other objects, each with a name and, at some depth, a timeseries or timetable.
 
-SciPy's reader trusts the sizes and types that it finds, and a damaged file can end the interpreter; here
-each is compared with the bytes that are there before it is used.
+The reader of SciPy trusts the sizes and types that it finds, and a damaged file can end the interpreter. Here
+each size and type is compared with the available bytes before it is used.
 
 Source:
     The MathWorks, MAT-File Format, 2023.
@@ -26,24 +26,24 @@ from jaxtyping import Float, UInt8, UInt32
 from rotflex_jax.data.tables import check_size
 
 REFERENCE = 0xDD000000
-"""First number of what stands for an object."""
+"""First number of an array that refers to an object."""
 
 SECONDS = {"milliseconds": 1e-3, "seconds": 1.0, "minutes": 60.0, "hours": 3600.0, "days": 86400.0}
 """Units of the times of a timeseries [s]."""
 
-_NEWEST = 4  # version of the part
+_NEWEST = 4  # newest known version of the nameless part
 _VALUE = 1  # kind of a property that has a value of its own
-_FIRST_VALUE = 2  # values before those of properties
+_FIRST_VALUE = 2  # number of values before the values of properties
 _MOST_RECORDS = 100_000
 
 
 @dataclass(frozen=True)
 class MatlabObject:
-    """Stands for an object whose insides only MATLAB knows, such as iddata.
+    """An object whose contents only MATLAB can read, such as iddata.
 
     Args:
-        kind: its class.
-        content: what is stored in its place: the number of the object, or all values of the nameless part.
+        kind: class of the object.
+        content: stored value: the reference to the object, or all values of the nameless part.
     """
 
     kind: str
@@ -51,18 +51,18 @@ class MatlabObject:
 
 
 class Timetable(dict[str, Any]):
-    """Columns of a timetable by name, `Time` with the times of all [s]; `Data` of a timeseries."""
+    """Columns of a timetable by name, with their times in `Time` [s]; a timeseries has the column `Data`."""
 
 
 class StoredObjects:
-    """The insides of the objects of a file.
+    """The contents of the objects of a file.
 
     Args:
         values: names and numbers as bytes, then values.
-        order: `<` or `>`.
+        order: byte order, `<` or `>`.
 
     Raises:
-        ValueError: they are not as MATLAB writes them.
+        ValueError: the values do not have the format of MATLAB.
     """
 
     def __init__(self, values: Sequence[Any], order: str) -> None:
@@ -82,7 +82,7 @@ class StoredObjects:
         self._logged: dict[tuple[int, str], dict[str, Any]] = {}
 
     def properties(self, reference: Any) -> dict[str, Any]:
-        """Values of the properties of an object that are stored with it."""
+        """Values of the properties that are stored with an object."""
         number = referred(reference)
         if number is None or number < 1 or 6 * number + 6 > len(self.of_object):
             raise ValueError("a reference leads to no object")
@@ -95,7 +95,7 @@ class StoredObjects:
         return found
 
     def seconds(self, reference: Any) -> Float[np.ndarray, " N"]:
-        """Durations [s], or dates as seconds since the first."""
+        """Durations [s], or dates as seconds since the first date."""
         inside = self.properties(reference)
         if "millis" in inside:
             return np.atleast_1d(np.asarray(inside["millis"], float)) * 1e-3
@@ -107,7 +107,7 @@ class StoredObjects:
         inside = self.properties(reference)["any"]
         columns = dict(zip(_cells(inside["varNames"]), _cells(inside["data"]), strict=True))
         times = inside["rowTimes"]
-        if isinstance(times, dict):  # evenly spaced, by a step or by a rate
+        if isinstance(times, dict):  # evenly spaced, given by a step or by a rate
             rate = bool(np.any(times.get("specifiedAsRate", False)))
             step = 1 / float(times["sampleRate"]) if rate else float(self.seconds(times["stepSize"])[0])
             rows = max(len(np.atleast_1d(column)) for column in columns.values())
@@ -122,7 +122,7 @@ class StoredObjects:
         return dict(zip(_cells(inside["varnames"]), _cells(inside["data"]), strict=True))
 
     def timeseries(self, reference: Any) -> Timetable:
-        """Data and times of a timeseries: stored, or those of a first time and a step."""
+        """Data and times of a timeseries; the times are stored, or follow from a first time and a step."""
         inside = self.properties(reference)
         about = self.properties(inside["TimeInfo"]) if "TimeInfo" in inside else {}
         data, t = (_either(inside, name) for name in ("Data", "Time"))
@@ -130,13 +130,13 @@ class StoredObjects:
         if not len(t):
             count = _either(about, "Length")
             shape = np.shape(data) or (1,)
-            # Without times of its own it may be Simulink's, with time last.
+            # Without stored times it may be from Simulink, with time as the last axis.
             count = shape[-1 if len(shape) > 2 else 0] if count is None else int(count)
             if not 0 <= count <= np.size(data):
                 raise ValueError("a timeseries has more times than values")
             t = float(_either(about, "Start") or 0.0) + float(_either(about, "Increment")) * np.arange(count)
         data = np.atleast_1d(np.asarray(data))
-        if data.shape[0] != len(t):  # Simulink has the time last
+        if data.shape[0] != len(t):  # Simulink has time as the last axis
             data = np.moveaxis(data, -1, 0)
         if data.shape[0] != len(t) or data.dtype == object:
             raise ValueError("a timeseries has not as many values as times")
@@ -145,22 +145,22 @@ class StoredObjects:
         return Timetable({"Time": SECONDS[about.get("Units", "seconds")] * t, "Data": values})
 
     def kind(self, reference: Any) -> str:
-        """Class of an object with the package it belongs to."""
+        """Class of an object, with its package."""
         package, name = self.of_class[4 * int(np.asarray(reference)[-1]) :][:2]
         return f"{self.names[package - 1]}.{self.names[name - 1]}" if package else self.names[name - 1]
 
     def logged(self, value: Any, name: str = "", seen: tuple[int, ...] = ()) -> dict[str, Any]:
-        """Timeseries and timetables at any depth of an object, by the names of the objects that hold them.
+        """Timeseries and timetables at any depth of an object, by the names of the objects that contain them.
 
-        In which property a version of Simulink keeps its signals does not matter.
+        It does not matter in which property a version of Simulink stores its signals.
 
         Args:
             value: reference to the object, or cells or a structure of references.
-            name: of what holds it.
-            seen: numbers of the objects on the way there.
+            name: name of the object that contains it.
+            seen: numbers of the objects on the path to it.
 
         Raises:
-            ValueError: objects lead back to themselves or are too deep, or two signals have one name.
+            ValueError: objects contain themselves or are nested too deeply, or two signals have one name.
         """
         number = referred(value)
         if number is None:
@@ -170,7 +170,7 @@ class StoredObjects:
             return _joined(self.logged(part, name, seen) for part in parts) if nested else {}
         if number in seen or len(seen) > DEEPEST_NESTING:
             raise ValueError("objects hold each other")
-        # What several ways lead to is read once: each object may refer twice to the next.
+        # An object with several paths to it is read once: each object may refer to the next one twice.
         if (kind := self.kind(value)) in self.signals:
             if number not in self._signals:
                 self._signals[number] = self.signals[kind](value)
@@ -185,11 +185,11 @@ class StoredObjects:
 
     @property
     def signals(self) -> dict[str, Callable[[Any], Any]]:
-        """What reads each class with times and values."""
+        """Class with times and values -> method that reads it."""
         return {"timetable": self.timetable, "timeseries": self.timeseries}
 
     def opened(self, value: Any) -> Any:
-        """A value with the signals of objects in it as columns; objects without any stay as they are."""
+        """A value with the signals of its objects as columns; objects without signals stay unchanged."""
         if isinstance(value, dict):
             return {name: self.opened(part) for name, part in value.items()}
         if isinstance(value, list):
@@ -202,18 +202,16 @@ class StoredObjects:
         try:
             return read.get(value.kind, self.logged)(value.content) or value
         except (ValueError, KeyError, IndexError, TypeError, AttributeError, OverflowError):
-            return (
-                value  # of a version that is not known, or damaged: an error names it where it is asked for
-            )
+            return value  # unknown version, or damaged: an error names it if the user asks for it
 
 
 def _either(inside: dict[str, Any], name: str) -> Any:
-    """A property that MATLAB keeps under its name with an underscore behind it, or without."""
+    """A property that MATLAB stores under its name, with or without an underscore after it."""
     return inside.get(f"{name}_", inside.get(name))
 
 
 def referred(value: Any) -> int | None:
-    """Number of the one object that an array stands for, None where it stands for none or several."""
+    """Number of the object to which an array refers; None if it refers to no object or to several."""
     numbers = np.asarray(value)
     if numbers.dtype != np.uint32 or numbers.ndim != 1 or len(numbers) != 6 or numbers[0] != REFERENCE:
         return None
@@ -228,7 +226,7 @@ def _bytes(value: Any) -> bytes:
 
 
 def _records(numbers: list[int]) -> list[list[tuple[int, int, int]]]:
-    """Name, kind and value of the properties of each object, behind their count, with an even length each."""
+    """Name, kind and value of the properties of each object; each record begins with their count."""
     found, at = [], 0
     while at < len(numbers) and len(found) < _MOST_RECORDS:
         end = at + 1 + 3 * numbers[at]
@@ -241,10 +239,10 @@ def _records(numbers: list[int]) -> list[list[tuple[int, int, int]]]:
 
 
 def _joined(parts: Iterable[dict[str, Any]]) -> dict[str, Any]:
-    """Signals of several objects."""
+    """Signals of several objects in one dictionary."""
     found: dict[str, Any] = {}
     for part in parts:
-        # One signal may be reached by several ways.
+        # One signal may be reached by several paths.
         if twice := {name for name in found.keys() & part.keys() if found[name] is not part[name]}:
             raise ValueError(f"two signals have the name {min(twice)!r}")
         found |= part
@@ -252,15 +250,15 @@ def _joined(parts: Iterable[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _cells(value: Any) -> list[Any]:
-    """Cells, of which a single one stands alone."""
+    """List of cells; a single cell is stored without a list."""
     return list(value) if isinstance(value, np.ndarray) and value.dtype == object else [value]
 
 
 DEEPEST_NESTING = 50
-"""Structures and cells within one another."""
+"""Largest depth of nested structures and cells."""
 
 MOST_PARTS = 1_000_000
-"""Arrays in structures and cells, of one file."""
+"""Largest number of arrays in structures and cells of one file."""
 
 _NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
 _ENCODINGS = {1: "latin-1", 2: "latin-1", 4: "utf-16", 16: "utf-8", 17: "utf-16", 18: "utf-32"}
@@ -271,7 +269,7 @@ _VERSION_4 = ("f8", "f4", "i4", "i2", "u2", "u1")
 
 
 SKIPPED = object()
-"""Stands for what is no signal: sparse matrices, objects, functions."""
+"""Placeholder for values that are no signals: sparse matrices, objects, functions."""
 
 
 def variables_of_mat(data: bytes, label: str, max_bytes: int) -> dict[str, Any]:
@@ -279,12 +277,12 @@ def variables_of_mat(data: bytes, label: str, max_bytes: int) -> dict[str, Any]:
 
     Args:
         data: content of the file.
-        label: what an error calls it.
-        max_bytes: size of what is unpacked [bytes].
+        label: name of the file in an error message.
+        max_bytes: largest unpacked size [bytes].
 
     Raises:
-        ValueError: what the file says of itself does not agree.
-        InputError: it unpacks to more than `max_bytes`.
+        ValueError: sizes or types in the file do not agree.
+        InputError: the file unpacks to more than `max_bytes`.
     """
     if 0 in data[:4]:
         return _version_4(data)
@@ -294,7 +292,7 @@ def variables_of_mat(data: bytes, label: str, max_bytes: int) -> dict[str, Any]:
     order = "<" if mark == b"IM" else ">"
     file = _Elements(data, order)
     found: dict[str, Any] = {}
-    inside: Any = None  # of the objects
+    inside: Any = None  # contents of the objects
     place = struct.unpack_from(f"{order}Q", data, 116)[0]
     at, unpacked = 128, len(data)
     while at < len(data):
@@ -315,7 +313,7 @@ def variables_of_mat(data: bytes, label: str, max_bytes: int) -> dict[str, Any]:
         at = end
         if begin == place and not name:
             inside = value
-        if value is SKIPPED or not name:  # without a name: data of MATLAB's own
+        if value is SKIPPED or not name:  # without a name: internal data of MATLAB
             continue
         if name in found:
             raise ValueError(f"it has two variables {name!r}")
@@ -325,7 +323,7 @@ def variables_of_mat(data: bytes, label: str, max_bytes: int) -> dict[str, Any]:
 
 
 def _stored_objects(inside: Any, order: str) -> StoredObjects | None:
-    """The insides of the objects, None where they are of a version that is not known."""
+    """The contents of the objects; None if their version is not known."""
     try:
         data = np.asarray(inside, np.uint8).tobytes()
         part = _Elements(data, order)
@@ -351,12 +349,12 @@ def _unpack(data: bytes, label: str, before: int, max_bytes: int) -> bytes:
 
 @dataclass
 class _Elements:
-    """Elements of data: a type, a size, and as many bytes.
+    """Elements of data: a type, a size, and as many bytes as the size.
 
     Args:
         data: bytes.
-        order: `<` or `>`.
-        parts: arrays in structures and cells so far.
+        order: byte order, `<` or `>`.
+        parts: number of arrays in structures and cells so far.
     """
 
     data: bytes
@@ -368,7 +366,7 @@ class _Elements:
         if at + 8 > end:
             raise ValueError(f"it ends at byte {at}, inside a variable")
         kind, size = struct.unpack_from(f"{self.order}II", self.data, at)
-        if kind >> 16:  # up to four bytes, which stand in place of the size
+        if kind >> 16:  # up to four bytes, stored in place of the size
             kind, size, start = kind & 0xFFFF, kind >> 16, at + 4
             if size > 4:
                 raise ValueError(f"a short element at byte {at} claims {size} bytes")
@@ -379,7 +377,7 @@ class _Elements:
         return kind, start, start + size, start + size + -size % 8
 
     def numbers(self, at: int, end: int, kinds: tuple[int, ...] = ()) -> tuple[np.ndarray, int]:
-        """The numbers of an element, and where the next one begins."""
+        """The numbers of an element, and where the next element begins."""
         kind, start, stop, after = self.element(at, end)
         if kind not in _NUMBERS or (kinds and kind not in kinds):
             raise ValueError(f"an element of type {kind} stands where numbers should, at byte {at}")
@@ -433,7 +431,7 @@ class _Elements:
         return name, _squeezed(values, shape)
 
     def object(self, at: int, end: int, depth: int) -> tuple[str, Any]:
-        """Name and class of an object, and what is stored in its place."""
+        """Name of an object, and the object with its class and stored value."""
         name, at = self.text(at, end)
         _, at = self.text(at, end)  # the system it belongs to
         kind, at = self.text(at, end)
@@ -441,7 +439,7 @@ class _Elements:
         return name, MatlabObject(kind, content)
 
     def parts_of(self, at: int, end: int, count: int, depth: int) -> list[Any]:
-        """So many arrays, one behind the other."""
+        """The next `count` arrays."""
         if 8 * count > end - at:  # each has at least a type and a size
             raise ValueError(f"{count} parts are claimed at byte {at}, but {end - at} bytes are there")
         found = []
@@ -453,7 +451,7 @@ class _Elements:
         return found
 
     def cells(self, at: int, end: int, shape: list[int], depth: int) -> Any:
-        """Values in an array of objects."""
+        """Values of cells, in an array of Python objects."""
         values = self.parts_of(at, end, math.prod(shape), depth)
         cells = np.empty(len(values), dtype=object)
         for k, value in enumerate(values):
@@ -461,7 +459,7 @@ class _Elements:
         return _squeezed(cells, shape)
 
     def structures(self, at: int, end: int, shape: list[int], depth: int) -> Any:
-        """A dictionary, or a list of them."""
+        """A structure as a dictionary, or an array of structures as a list of dictionaries."""
         lengths, at = self.numbers(at, end, (_INT32,))
         if len(lengths) != 1 or lengths[0] < 1:
             raise ValueError("a structure has names without length")
@@ -481,7 +479,7 @@ class _Elements:
         return found[0] if count == 1 else found
 
     def characters(self, at: int, end: int, shape: list[int]) -> Any:
-        """Text, or an array of it."""
+        """Text, or an array of texts."""
         kind, start, stop, _ = self.element(at, end)
         if kind not in _ENCODINGS:
             raise ValueError(f"an element of type {kind} stands where text should, at byte {at}")
@@ -496,7 +494,7 @@ class _Elements:
 
 
 def _squeezed(values: np.ndarray, shape: list[int]) -> Any:
-    """Without axes of length 1; a single number is no array. MATLAB stores column by column."""
+    """The array without axes of length 1, or a single number; MATLAB stores column by column."""
     if not values.size:
         return values
     found = values.reshape(shape, order="F").squeeze()
@@ -504,7 +502,7 @@ def _squeezed(values: np.ndarray, shape: list[int]) -> Any:
 
 
 def _version_4(data: bytes) -> dict[str, Any]:
-    """Full matrices and text of the format before 1996."""
+    """Full matrices and text of version 4, the format before 1996."""
     order = "<" if 0 <= struct.unpack_from("<i", data.ljust(4, b"\0"))[0] <= 5000 else ">"
     found: dict[str, Any] = {}
     at = 0

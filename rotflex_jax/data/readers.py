@@ -1,9 +1,6 @@
-"""Readers of the public recordings: a file, or the files of one run, to Recordings.
+"""Readers of the public recordings: from a file, or the files of one run, to Recordings.
 
-Angles become radians. A log whose clock is uneven is resampled, and says so in `source`.
-The ROTFLEX set has two closed-loop runs of a student laboratory at 500 Hz with 4096-count encoders:
-reference a square wave of 30 degrees, feedback of theta in one and of theta + alpha in the other. Between
-the steps dry friction holds the hub away from the reference.
+Angles become radians. A log with uneven sampling times is resampled, and its `source` states this.
 """
 
 import csv
@@ -42,27 +39,27 @@ LABORATORY = MappingProxyType(
         "K": (1.0142, "N m/rad"),
     }
 )
-"""The laboratory's own parameters: name to value and unit, without dry friction."""
+"""Parameters given by the laboratory: name -> value and unit; dry friction is not among them."""
 
 COUNT = 2 * math.pi / 4096
 """One count of the encoders [rad]."""
 
 
 def load_rotflex(path: str | os.PathLike[str]) -> Recording:
-    """Reads one run: motor voltage, servo angle and deflection, degrees turned into radians.
+    """Reads one ROTFLEX run: motor voltage, servo angle and deflection, converted from degrees to radians.
 
-    A student laboratory logged two closed-loop runs at 500 Hz with 4096-count encoders: reference a
-    square wave of 30 degrees, feedback of theta in one and of theta + alpha in the other. Dry friction
-    holds the hub still between the steps, at angles that the controller would not have chosen.
+    A student laboratory logged two closed-loop runs at 500 Hz with 4096-count encoders. The reference is a
+    square wave of 30 degrees; one run has feedback of theta, the other of theta + alpha. Between the steps
+    dry friction holds the hub at rest, away from the reference.
 
     Args:
-        path: of the MAT file.
+        path: path of the MAT file.
 
     Returns:
-        The recording, channels theta and alpha [rad].
+        The recording with the channels theta and alpha [rad].
 
     Raises:
-        InputError: the file is missing, damaged, or has not the variables of such a run.
+        InputError: the file is missing or damaged, or lacks the variables of such a run.
     """
     file = readable_file(path)
     variables = read_mat(file)
@@ -86,7 +83,7 @@ def load_rotflex(path: str | os.PathLike[str]) -> Recording:
 
 
 ARM_LENGTH = 0.45
-"""Hub to tip of the rotary arm [m]."""
+"""Distance from the hub to the tip of the rotary arm [m]."""
 
 
 def load_emps(path: str | os.PathLike[str]) -> Recording:
@@ -95,10 +92,10 @@ def load_emps(path: str | os.PathLike[str]) -> Recording:
     The force is 35.1507 N per volt. Protocol: free run, the first 20 samples for initialisation.
 
     Args:
-        path: of the MAT file.
+        path: path of the MAT file.
 
     Returns:
-        The recording, channel position [m].
+        The recording with the channel position [m].
 
     Source:
         Janot, Gautier, Brunot 2019, Data set and reference models of EMPS.
@@ -122,11 +119,11 @@ def load_silverbox(path: str | os.PathLike[str]) -> list[Recording]:
     Protocol: free run, the first 50 samples for initialisation.
 
     Args:
-        path: of the MAT file.
+        path: path of the MAT file.
 
     Returns:
-        The official parts, channel output [V]: a multisine for training, one for testing, an arrow
-        of growing amplitude, and the arrow within the amplitudes of the first part.
+        The official parts with the channel output [V]: a multisine for training, one for testing, an arrow
+        of growing amplitude, and the arrow without amplitudes beyond those of the first part.
 
     Source:
         Wigren, Schoukens 2013, Three free data sets for development and benchmarking in nonlinear
@@ -155,16 +152,16 @@ def load_silverbox(path: str | os.PathLike[str]) -> list[Recording]:
 def load_rotary_arm(path: str | os.PathLike[str]) -> Recording:
     """Reads a run of a geared motor with a rigid or a flexible arm, rounded to 1 mrad and 1 mm.
 
-    Motor constants: gear ratio 48.4, 0.0107 N m/A, 3.29 ohm. The time is in milliseconds, whatever
-    the header says. The tip of the flexible arm was measured as a distance, positive where the tip is behind
-    the hub (after a step of the voltage it has the sign of the hub's motion). Its angle is
-    `alpha = -tip / 0.45 m`, so that theta + alpha points at the tip.
+    Motor constants: gear ratio 48.4, 0.0107 N m/A, 3.29 ohm. The time is in milliseconds, although the header
+    may state another unit. The tip of the flexible arm was measured as a distance, which is positive when the
+    tip lags behind the hub: after a step of the voltage it has the sign of the hub's motion. The deflection
+    is `alpha = -tip / 0.45 m`, so that theta + alpha points at the tip.
 
     Args:
-        path: of the text file.
+        path: path of the text file.
 
     Returns:
-        The recording, channel theta [rad] and, where the arm is flexible, alpha [rad].
+        The recording with the channel theta [rad] and, for the flexible arm, alpha [rad].
     """
     file = readable_file(path)
     t, theta, tip, *_ = columns = np.loadtxt(file, skiprows=1).T
@@ -180,51 +177,52 @@ def load_rotary_arm(path: str | os.PathLike[str]) -> Recording:
 
 
 LINK_STEP = MappingProxyType({1: COUNT / 100, 2: COUNT / 50})
-"""Encoder step of each stage of the two-link machine, behind its gear [rad]."""
+"""Encoder step of each stage of the two-link machine, at the output of its gear [rad]."""
 
 GAUGE_RAD_PER_VOLT = MappingProxyType({1: 1.286e-4 * 106.03674540682414, 2: 1.235e-4 * 151.36857892763405})
-"""Deflection of each link per volt of its strain gauge, by the laboratory's file [rad/V]."""
+"""Deflection of each link per volt of its strain gauge, from the laboratory's file [rad/V]."""
 
 GAUGE_FILTER_FREQUENCY, GAUGE_FILTER_DAMPING = 4 * math.pi, 0.9
-"""Low pass that the deflections went through before they were logged, 2 Hz [rad/s], and its damping ratio."""
+"""Frequency (2 Hz) [rad/s] and damping ratio of the low-pass filter through which deflections were logged."""
 
 ACCELERATION_SAMPLES, ACCELERATION_DEGREE = 71, 5
-"""Local polynomials whose second derivative is the acceleration of a link, 0.14 s at 500 Hz.
+"""Length (0.14 s at 500 Hz) and degree of the local polynomials that give the acceleration of a link.
 
-They keep 97 % of it at 5 Hz, where link 2 swings, 70 % at 10 Hz, and next to nothing above 20 Hz, where the
-gauges have noise. Cubic ones over 0.08 s pass as much noise, and keep 89 and 61 %.
+They keep 97 % of the acceleration at 5 Hz, where link 2 oscillates, 70 % at 10 Hz, and almost nothing above
+20 Hz, where the gauges have noise. Cubic polynomials over 0.08 s pass as much noise, but keep only 89 % and
+61 %.
 """
 
 
 def load_two_dof_link(path: str | os.PathLike[str], *, filtered: bool = False) -> list[Recording]:
     """Reads a run of the serial link with two flexible stages: motor current to servo angle and deflection.
 
-    A run is one file with all signals, or six files with one signal each, of which any is named here.
-    The input is the measured current. The converter reads it before it writes the next command, so that
-    reading k + 1 is the current held from sample k on.
+    A run is one file with all signals, or six files with one signal each; give any of the six. The input is
+    the measured current. The converter reads the current before it writes the next command, so reading k + 1
+    is the current that is held from sample k on.
 
-    The deflections were logged behind a second-order low pass (2 Hz, damping ratio 0.9), integrated by
-    Euler's method at 2 ms. That filter is inverted sample by sample, without any loss: the result lies on
-    the counts of the converter again. While the gauge's reading at rest was being found, the log has a
-    deflection of zero; that beginning is left out.
+    The deflections were logged through a second-order low-pass filter (2 Hz, damping ratio 0.9), integrated
+    by Euler's method at 2 ms. This filter is inverted sample by sample, without any loss: the result lies on
+    the counts of the converter again. At the beginning, until the offset of the gauge was determined, the log
+    has a deflection of zero; this beginning is left out.
 
-    Stage 2 is carried by link 1, and pushes against it. So each recording has the acceleration of the other
-    link as a signal, that of link 2 relative to link 1: the second derivative of theta + alpha of the other
-    stage, in the middle of each sample, by local polynomials that look 0.07 s ahead. Where the deflection of
-    the other stage is not logged yet, it is that of theta alone. It is less exact for 0.07 s where theta or
-    alpha begins, and before they end.
+    Stage 2 is mounted on link 1 and reacts on it. Therefore each recording has the acceleration of the other
+    link as a signal; the acceleration of link 2 is relative to link 1. It is the second derivative of
+    theta + alpha of the other stage, in the middle of each sample, from local polynomials that reach 0.07 s
+    ahead. As long as the deflection of the other stage is not logged, it is the second derivative of theta
+    alone. It is less accurate for 0.07 s after the beginning of theta or alpha, and before their end.
 
     Args:
-        path: of a MAT file.
-        filtered: whether the deflections are to be left behind their filter, also those of the signals.
+        path: path of a MAT file.
+        filtered: whether to keep the deflections as they were filtered, also in the signals.
 
     Returns:
-        A recording of stage 1 and one of stage 2, channels theta and alpha [rad], that end two samples
-        before the file, with the signal "acceleration of link 2 [rad/s^2]" and "acceleration of link 1
-        [rad/s^2]".
+        A recording of stage 1 and a recording of stage 2, with the channels theta and alpha [rad]. Both end
+        two samples before the end of the file. They have the signals "acceleration of link 2 [rad/s^2]" and
+        "acceleration of link 1 [rad/s^2]".
 
     Raises:
-        InputError: the file is missing, damaged, or has not the variables of such a run.
+        InputError: the file is missing or damaged, or lacks the variables of such a run.
     """
     file = readable_file(path)
     kind, _, signal = file.stem.rpartition("_")
@@ -241,7 +239,7 @@ def load_two_dof_link(path: str | os.PathLike[str], *, filtered: bool = False) -
             f"{label} lacks {', '.join(missing)}, which a run of the two-link machine has; "
             "read another file with load(path, input=..., outputs=...)."
         )
-    # Every signal has the columns time, reference or command, measurement.
+    # Each signal has the columns: time, reference or command, measurement.
     signals = {
         part: np.asarray(variables[name], dtype=float) for part, name in zip(parts, names, strict=True)
     }
@@ -284,17 +282,17 @@ def load_two_dof_link(path: str | os.PathLike[str], *, filtered: bool = False) -
 
 
 def stages_together(first: Recording, second: Recording) -> Recording:
-    """Both stages of a run of `load_two_dof_link` as one recording, while both have samples.
+    """Both stages of a run from `load_two_dof_link` as one recording, over the time that both have.
 
     Args:
-        first: Stage 1; its current is the input.
-        second: Stage 2; its current is the signal "current of motor 2 [A]".
+        first: Recording of stage 1; its current is the input.
+        second: Recording of stage 2; its current is the signal "current of motor 2 [A]".
 
     Returns:
         A recording with the channels theta1, alpha1, theta2, alpha2 for `joints.two_stage_link`.
 
     Raises:
-        InputError: They are not stages 1 and 2 of one run.
+        InputError: The recordings are not stages 1 and 2 of one run.
     """
     ends = [r.start + r.N * r.Ts for r in (first, second)]
     files, stages = zip(*(r.source.split(", ")[:2] for r in (first, second)), strict=True)
@@ -332,7 +330,7 @@ def link_acceleration(
     Args:
         theta: Angle of the servo [rad].
         alpha: Deflection [rad].
-        first: First sample with a deflection; before it counts as constant.
+        first: First sample with a deflection; before it, the deflection counts as constant.
         Ts: Sampling period [s].
     """
     acceleration = _acceleration(theta, Ts)
@@ -341,7 +339,7 @@ def link_acceleration(
 
 
 def _acceleration(x: Float[np.ndarray, " N"], Ts: float) -> Float[np.ndarray, " N"]:
-    """Second derivative in the middle of each sample, of the polynomial about that sample."""
+    """Second derivative in the middle of each sample, from the local polynomial around that sample."""
     there, change = (smoothed(x, ACCELERATION_SAMPLES, ACCELERATION_DEGREE, n, Ts) for n in (2, 3))
     return there + Ts / 2 * change
 
@@ -354,36 +352,36 @@ def _before_gauge_filter(y: Float[np.ndarray, " N"], Ts: float) -> Float[np.ndar
 
 
 def _gauge_step(alpha: Float[np.ndarray, " N"], stage: int) -> float | None:
-    """Step of the deflection behind a converter of 20 V and 14 or 16 bits [rad], None if it has none."""
+    """Step of the deflection from a converter of 20 V with 14 or 16 bits [rad]; None if there is no step."""
     steps = [GAUGE_RAD_PER_VOLT[stage] * 20 / 2**bits for bits in (14, 16)]
-    counts = [(alpha - alpha[0]) / step for step in steps]  # less the gauge's reading at rest
+    counts = [(alpha - alpha[0]) / step for step in steps]  # without the offset of the gauge
     fits = (step for step, n in zip(steps, counts, strict=True) if np.max(np.abs(n - np.round(n))) < 0.01)
     return next(fits, None)
 
 
 SERVO = "hub.position_servo"
-"""Where the ready-made servos have their firmware."""
+"""Port and name of the firmware effect in the ready-made servos."""
 
 BAM_PERIOD = 0.005
-"""Sampling period that the logs of the XL-330 are resampled to; they were taken every 5.1 to 7.1 ms [s]."""
+"""Sampling period to which logs of the XL-330 are resampled; they were sampled every 5.1 to 7.1 ms [s]."""
 
 
 def load_bam_xl330(path: str | os.PathLike[str]) -> Recording:
     """Reads a run of a position servo that lifts a pendulum: goal angle to angle.
 
     Goal and angle were logged together, at uneven times, and are resampled to 5 ms by linear
-    interpolation. Where the torque is switched off the arm falls freely; the recording ends there, and
+    interpolation. When the torque is switched off, the arm falls freely. The recording ends there;
     `load_bam_xl330_released` reads the rest.
 
     Args:
-        path: of the JSON file.
+        path: path of the JSON file.
 
     Returns:
-        The recording, input goal [rad], channel theta [rad]; its `constants` are the gain and the supply that
-        the servo was set to, as `rotflex_jax.joints.xl330_pendulum` names them.
+        The recording with the input goal [rad] and the channel theta [rad]. Its `constants` are the gain and
+        the supply of the servo, under the parameter names of `rotflex_jax.joints.xl330_pendulum`.
 
     Raises:
-        InputError: the file is missing, damaged, or no log of such a run.
+        InputError: the file is missing or damaged, or is no log of such a run.
 
     Source:
         Duclusaud, Passault, Padois, Ly 2024, Extended friction models for the physics simulation of servo
@@ -401,14 +399,14 @@ def load_bam_xl330(path: str | os.PathLike[str]) -> Recording:
 
 
 def load_bam_xl330_released(path: str | os.PathLike[str]) -> Recording | None:
-    """Reads the rest of such a run, from where the torque is off: the arm falls and swings freely.
+    """Reads the rest of a run of `load_bam_xl330`, after the torque is switched off: the arm falls freely.
 
     Args:
-        path: of the JSON file.
+        path: path of the JSON file.
 
     Returns:
-        The recording with the constant `hub.position_servo.enabled` zero, for a servo that has this parameter
-        (`rotflex_jax.joints.servo`); None where the torque is never off, or for less than a second.
+        The recording, with the constant `hub.position_servo.enabled` zero, for a servo with this parameter
+        (`rotflex_jax.joints.servo`). None if the torque is never off, or for less than a second.
 
     Raises:
         InputError: as `load_bam_xl330`.
@@ -431,13 +429,13 @@ class _BamLog(NamedTuple):
     """A run of the XL-330 as it was logged.
 
     Attributes:
-        file: its name.
+        file: name of the file.
         what: motion and gain, in words.
         t: times [s].
         goal: goal [rad].
         theta: angle [rad].
         on: whether the torque is on.
-        settings: of the servo, by full names of parameters.
+        settings: full name of a parameter -> setting of the servo.
     """
 
     file: str
@@ -449,7 +447,7 @@ class _BamLog(NamedTuple):
     settings: dict[str, float]
 
     def recording(self, part: slice, note: str, further: dict[str, float]) -> Recording:
-        """A part of it, resampled."""
+        """A part of the run, resampled."""
         t, Ts = self.t[part], BAM_PERIOD
         return Recording(
             u=_resampled(t, self.goal[part], Ts, self.file),
@@ -485,30 +483,30 @@ SO101_JOINTS = ("Rotation", "Pitch", "Elbow", "Wrist_Pitch", "Wrist_Roll", "Jaw"
 """Joints of the SO-101 arm, in the order of its logs."""
 
 SO101_PERIOD = 0.02006
-"""Sampling period that the logs of the SO-101 are resampled to, that of their own clock on average [s]."""
+"""Sampling period to which logs of the SO-101 are resampled, the mean of their own periods [s]."""
 
 JAW_STEP = 1 / 1523
-"""Step of the jaw, whose position is a share of its travel of 1523 counts."""
+"""Quantisation step of the jaw, whose position is a share of its travel of 1523 counts."""
 
 
 def load_so101(path: str | os.PathLike[str]) -> list[Recording]:
     """Reads a motion of the six servos of an SO-101 arm: goal angle to angle, joint by joint.
 
-    A motion is two files, `*.control.csv` and `*.state_motor.csv`, plain or packed by gzip, of which either
-    is named here. Both have one clock that wanders by up to 1 %: goals and angles are resampled to 20.06 ms
-    by linear interpolation. A joint whose goal does not change has no recording. The jaw's positions are a
-    share of its travel, from 0 to 1, whatever the log says. A servo goes on at full speed and then stands,
-    which looks as if a sensor were saturated; that finding is accepted.
+    A motion is two files, `*.control.csv` and `*.state_motor.csv`, plain or packed by gzip; give either. Both
+    have the same sampling times, whose period varies by up to 1 %: goals and angles are resampled to 20.06 ms
+    by linear interpolation. A joint whose goal does not change has no recording. Positions of the jaw are a
+    share of its travel, from 0 to 1, although the log may state another unit. A servo may move at full speed
+    and then stop at once, which looks like a saturated sensor; this finding is accepted.
 
     Args:
-        path: of one of the two files.
+        path: path of one of the two files.
 
     Returns:
-        The recordings, input goal [rad], channel theta [rad], both without a unit for the jaw; motion and
-        joint are in their `source`.
+        The recordings with the input goal [rad] and the channel theta [rad], both without a unit for the jaw.
+        Their `source` names the motion and the joint.
 
     Raises:
-        InputError: a file is missing, damaged, or no log of such a motion.
+        InputError: a file is missing or damaged, or is no log of such a motion.
     """
     file = readable_file(path)
     motion = file.name.partition(".")[0]
@@ -552,7 +550,7 @@ def _so101_table(path: Path) -> tuple[Float[np.ndarray, " N"], Float[np.ndarray,
 
 
 def _packed_or_not(path: Path) -> Path:
-    """The file, or the one beside it that gzip has packed."""
+    """The path of the file, or of its version packed by gzip in the same folder."""
     packed = path.with_name(f"{path.name}.gz")
     return readable_file(packed if packed.exists() and not path.exists() else path)
 
@@ -572,7 +570,7 @@ def unpacked(path: Path) -> bytes:
 
 
 def _resampled(t: Float[np.ndarray, " N"], x: Float[np.ndarray, " N"], Ts: float, label: str) -> np.ndarray:
-    """A signal at uneven times, at even ones by linear interpolation, from the first sample on."""
+    """A signal with uneven times, interpolated linearly at even times from the first sample on."""
     steps = np.diff(t)
     if len(t) < 2 or steps.min() <= 0 or steps.max() > 2 * np.median(steps):
         raise InputError(

@@ -1,6 +1,6 @@
-"""The public recordings: address, hash, reader, units and licence as far as known.
+"""The public recordings: address, hash, reader, units, and the licence as far as it is known.
 
-Those of the package `nonlinear_benchmarks` need no entry:
+Recordings of the package `nonlinear_benchmarks` need no entry:
 
     train, test = nonlinear_benchmarks.Cascaded_Tanks()
     rf.load(train, outputs="level", units={"level": "V"})
@@ -30,12 +30,12 @@ class PublicFile:
     """A file at a fixed address.
 
     Args:
-        name: its path in a local folder of recordings.
-        repository: public repository it is kept in.
+        name: path of the file in a local folder of recordings.
+        repository: public repository that contains the file.
         commit: version of the repository.
-        path: its path there.
+        path: path of the file in the repository.
         sha256: hash of its content.
-        companion: whether the reader finds it beside another file of the same run.
+        companion: whether the reader reads it together with another file of the same run.
     """
 
     name: str
@@ -47,7 +47,7 @@ class PublicFile:
 
     @property
     def address(self) -> str:
-        """Where it is downloaded from."""
+        """Address from which the file is downloaded."""
         return ADDRESS.format(repository=self.repository, commit=self.commit, path=quote(self.path))
 
 
@@ -56,15 +56,15 @@ class PublicDataset:
     """A set of public recordings.
 
     Args:
-        name: to ask for it by.
+        name: name of the data set.
         about: one line on what was measured.
-        units: of the input and the outputs.
-        licence: what is known of it.
-        source: who made it.
-        files: where they are.
-        reader: file to Recording, or to several.
-        joint: preset of `rotflex_jax.joints` to begin with, where all recordings are of one machine that has
-            one, and none is kept for a protocol's test.
+        units: units of the input and the outputs.
+        licence: licence, as far as it is known.
+        source: authors of the data.
+        files: files of the data set.
+        reader: function that reads a file to one Recording or to several.
+        joint: preset of `rotflex_jax.joints` to begin with, if all recordings are of one machine with a
+            preset, and none is reserved for the test of a protocol.
     """
 
     name: str
@@ -323,11 +323,11 @@ class ByHand:
     """A public data set that is not downloaded here.
 
     Args:
-        name: to know it by.
+        name: name of the data set.
         about: one line on what was measured.
-        address: where its official loader takes it from.
-        loader: what gives it in `nonlinear_benchmarks`.
-        n_init: samples at the start of a test that a model may look at, by its protocol.
+        address: address from which its official loader downloads it.
+        loader: function of `nonlinear_benchmarks` that returns it.
+        n_init: samples at the start of a test that a model may use, according to the protocol.
     """
 
     name: str
@@ -338,7 +338,7 @@ class ByHand:
 
     @property
     def advice(self) -> str:
-        """What to do to have it."""
+        """How to get the data set."""
         return (
             f"get it from {self.address}, or `pip install nonlinear_benchmarks` and give what "
             f"nonlinear_benchmarks.{self.loader} returns to rf.load"

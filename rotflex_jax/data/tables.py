@@ -1,4 +1,4 @@
-"""Tables of named columns, delimited text as a table, and resampling on an even grid on request."""
+"""Tables of named columns, from delimited text and JSON, and resampling to even times on request."""
 
 import csv
 import json
@@ -21,14 +21,14 @@ class Table:
     """Named columns.
 
     Args:
-        label: its name in an error.
-        columns: by name; column k of a matrix is `name[k]`.
-        where: what a row is called.
+        label: name of the table in an error message.
+        columns: name -> column; column k of a matrix is `name[k]`.
+        where: word for one row in an error message.
         first: number of the first row.
-        units: by name, where the file has a line of them.
-        cut: what may be missing at the end, in a sentence; empty where nothing is.
-        objects: by name, the class of what only the program that wrote the file can read.
-        clocks: by name, the column with the times of a column, where the file says it.
+        units: name of a column -> unit, if the file has a line of units.
+        cut: sentence on what may be missing at the end; empty if nothing may be missing.
+        objects: name -> class, for objects that only the program that wrote the file can read.
+        clocks: name of a column -> name of the column with its times, if the file has this information.
     """
 
     label: str
@@ -41,14 +41,14 @@ class Table:
     clocks: Mapping[str, str] = field(default_factory=dict)
 
     def find(self, name: str, *others: str) -> str:
-        """The column that is meant by a name: that one, or one in other capitals or with a unit behind it.
+        """The column with a name, where capital letters and a unit after the name do not matter.
 
         Args:
-            name: what is wanted.
-            others: what it may be called as well.
+            name: name that is wanted.
+            others: other names of the same column.
 
         Returns:
-            The name of the column, or `name` where there is none, or more than one.
+            The name of the column, or `name` if there is no such column, or more than one.
 
         >>> table = Table("run.csv", {"Time [s]": np.zeros(1), "Theta (deg)": np.zeros(1)})
         >>> table.find("theta"), table.find("t", "time"), table.find("alpha")
@@ -57,7 +57,7 @@ class Table:
         if not isinstance(name, str) or name in self.columns:
             return name
         wanted = {other.casefold() for other in (name, *others)}
-        wanted |= {f"{other}.data" for other in wanted}  # of a timeseries of MATLAB
+        wanted |= {f"{other}.data" for other in wanted}  # column of a MATLAB timeseries
         like = [column for column in self.columns if name_and_unit(column)[0].casefold() in wanted]
         return like[0] if len(like) == 1 else name
 
@@ -65,11 +65,11 @@ class Table:
         """One column.
 
         Args:
-            name: its name.
-            what: the argument by which a user could name another.
+            name: name of the column.
+            what: argument with which a user could name another column.
 
         Raises:
-            InputError: there is none; the error lists those that are there.
+            InputError: the column does not exist; the message lists the existing columns.
         """
         if isinstance(name, str) and name in self.columns:
             return self.columns[name]
@@ -78,13 +78,13 @@ class Table:
         raise self._lacks(f"column {name!r}", f"name the right one with {what}")
 
     def check(self, wanted: Sequence[tuple[str, str]]) -> None:
-        """Refuse at once all columns that are not there, where they are more than one.
+        """Report all missing columns at once, if there are several.
 
         Args:
-            wanted: columns, each with the argument by which a user could name another.
+            wanted: columns, each with the argument with which a user could name another column.
 
         Raises:
-            InputError: several are missing; the error lists those that are there.
+            InputError: several columns are missing; the message lists the existing columns.
         """
         missing = [(n, what) for n, what in wanted if isinstance(n, str) and n not in self.columns]
         if len(missing) > 1:
@@ -95,7 +95,7 @@ class Table:
 
     def _lacks(self, what: str, then: str) -> InputError:
         longer = [key for key, values in self.columns.items() if len(values) > 1]
-        there = longer or list(self.columns)  # settings of one value are not worth offering
+        there = longer or list(self.columns)  # single values are settings, not signals
         short = [name if len(name) <= 40 else f"{name[:37]}..." for name in there[:20]]
         names = ", ".join(short) + (f" and {len(there) - 20} more" if len(there) > 20 else "")
         objects = ", ".join(f"{name} ({kind})" for name, kind in [*self.objects.items()][:5])
@@ -109,7 +109,7 @@ def distinct(names: Sequence[str], label: str) -> Sequence[str]:
     """The names, if no two are equal.
 
     Raises:
-        InputError: two are.
+        InputError: two names are equal.
     """
     seen: set[str] = set()
     for name in names:
@@ -123,20 +123,20 @@ def distinct(names: Sequence[str], label: str) -> Sequence[str]:
 
 
 MAX_BYTES = 2_000_000_000
-"""Size of a file, and of what it unpacks to, beyond which it is hardly one recording [bytes]."""
+"""Largest likely size of one recording, packed and unpacked [bytes]."""
 
 
 def check_size(label: str, size: int, max_bytes: int, what: str = "unpacks to at least") -> None:
-    """Refuse what is larger than one recording can be.
+    """Refuse data that are larger than one recording can be.
 
     Args:
-        label: what an error calls it.
-        size: how large it is, or becomes [bytes].
-        max_bytes: what is accepted [bytes].
-        what: verb before the size.
+        label: name of the data in an error message.
+        size: size of the data, or their size when unpacked [bytes].
+        max_bytes: largest accepted size [bytes].
+        what: verb before the size in the message.
 
     Raises:
-        InputError: it is larger.
+        InputError: the size is larger than `max_bytes`.
     """
     if size > max_bytes:
         raise InputError(
@@ -146,7 +146,7 @@ def check_size(label: str, size: int, max_bytes: int, what: str = "unpacks to at
 
 
 def unreadable(path: Path, what: str, error: Exception) -> InputError:
-    """The error for a file that is not what its ending says."""
+    """The error for a file that does not have the format of its ending."""
     reason = " ".join(str(error).split()).rstrip(".") or type(error).__name__
     return InputError(
         f"{path.name} cannot be read as {what} ({reason[:120]}); it may be damaged: export it again."
@@ -156,13 +156,13 @@ def unreadable(path: Path, what: str, error: Exception) -> InputError:
 def table_from_text(path: Path, max_bytes: int = MAX_BYTES) -> Table:
     """The columns of a text file in UTF-8 with a header.
 
-    The delimiter is a tab, semicolon, bar or comma, the first of these in the header, otherwise
-    spaces; a comma beside another delimiter is a decimal comma. Remarks with # or % may stand on
-    top, the last of them may be the header. A line of units may follow it.
+    The delimiter is the first of tab, semicolon, bar and comma that the header contains, otherwise
+    spaces. With a delimiter other than the comma, a comma is a decimal comma. Remark lines with # or % may
+    come first; the last of them may be the header. A line of units may follow the header.
 
     Raises:
-        InputError: no text, other text than UTF-8, no header, no samples, a line with more or fewer cells
-            than names, or one that is cut.
+        InputError: the file has no text, another encoding, no header, no samples, a line with more or fewer
+            cells than names, or a last line that is cut off.
     """
     text = _decoded(path, max_bytes)
     lines = text.splitlines()
@@ -184,7 +184,7 @@ def table_from_text(path: Path, max_bytes: int = MAX_BYTES) -> Table:
         raise InputError(f"{path.name} has a header, but no samples; export the recording again.")
     if delimiter != ",":
         rows = [row.replace(",", ".") for row in rows]
-    first = start + 2  # as an editor counts
+    first = start + 2  # line numbers as in an editor
     units = _units(rows, names, delimiter)
     if units:
         rows, first = rows[1:], first + 1
@@ -196,11 +196,12 @@ def table_from_text(path: Path, max_bytes: int = MAX_BYTES) -> Table:
 def table_from_json(path: Path, max_bytes: int = MAX_BYTES) -> Table:
     """The columns of a JSON file: a list of samples, each an object, or lists under the names of columns.
 
-    Such a list may stand under one name beside settings, as servo logs have it. A list of numbers in a sample
-    is several columns, `name[k]`.
+    The list of samples may be under one name, with settings under other names, as in servo logs. A list of
+    numbers in a sample gives several columns, `name[k]`.
 
     Raises:
-        InputError: no JSON, no such list or more than one, or a sample with other names than the first.
+        InputError: the file is no JSON, has no such list or more than one, or a sample has other names than
+            the first sample.
     """
     try:
         data = json.loads(_decoded(path, max_bytes))
@@ -247,7 +248,7 @@ def _are_samples(value: Any) -> bool:
 
 
 def _numbers_or_text(cells: Sequence[Any]) -> Shaped[np.ndarray, " N"]:
-    """Numbers where all cells are; else text, so that an error can name its place."""
+    """Numbers if all cells are numbers; else text, so that an error message can name the place."""
     if not all(isinstance(cell, int | float) for cell in cells):
         return np.array([str(cell) for cell in cells])
     return np.array([_number(cell) for cell in cells])
@@ -270,7 +271,7 @@ def _decoded(path: Path, max_bytes: int) -> str:
         if "\0" in text:
             raise ValueError(f"it has a zero byte in line {text[: text.index(chr(0))].count(chr(10)) + 1}")
     except UnicodeDecodeError as error:
-        # Data that are no text at all have control characters; old text has letters of one byte.
+        # Binary data have control characters; text in an old encoding has letters of one byte.
         if set(data) & (set(range(32)) - set(b"\t\n\v\f\r\x1a")):
             raise unreadable(path, "text in UTF-8", error) from error
         line = data.count(b"\n", 0, error.start) + 1
@@ -285,11 +286,11 @@ def _decoded(path: Path, max_bytes: int) -> str:
 
 
 def _cut(rows: list[str], delimiter: str | None, label: str, first: int) -> str:
-    """The doubt about a last number that no line end follows.
+    """A sentence of doubt about the last number of a file that does not end with a line end.
 
     Raises:
-        InputError: all other numbers of the column have as many decimals, and exponents of as many digits,
-            but the last one has not: it is certainly cut.
+        InputError: the last number is certainly cut: all other numbers of its column have the same number of
+            decimals and of digits in the exponent, but the last number has not.
     """
     last = rows[-1].rsplit(delimiter, 1)[-1].strip()
     others = {_form(row.rsplit(delimiter, 1)[-1].strip()) for row in rows[:-1]}
@@ -304,7 +305,7 @@ def _cut(rows: list[str], delimiter: str | None, label: str, first: int) -> str:
 
 
 def _form(cell: str) -> tuple[int, int]:
-    """Number of decimals and of digits of the exponent.
+    """Number of decimals, and number of digits of the exponent.
 
     >>> _form("-1.250e-05"), _form("12")
     ((3, 2), (0, 0))
@@ -318,14 +319,14 @@ def _header(lines: list[str]) -> int | None:
     filled = [k for k, line in enumerate(lines) if line.strip(" \t,;#%")]
     for before, k in zip([None, *filled], filled, strict=False):
         if not lines[k].startswith(("#", "%")):
-            # Below remarks come the names, or the numbers that the last remark has named.
+            # After the remarks come the names, or numbers whose names are in the last remark.
             numbers = _are_numbers(lines[k].replace(",", " ").replace(";", " ").split())
             return before if numbers and before is not None else k
     return filled[-1] if filled else None
 
 
 def _units(rows: list[str], names: list[str], delimiter: str | None) -> dict[str, str]:
-    """The units, where the line below the names holds no number and the next one nothing else."""
+    """The units, if the line below the names has no numbers and the line after that has only numbers."""
     cells = _cells(rows[0], delimiter)
     if len(cells) != len(names) or len(rows) < 2 or not _are_numbers(_cells(rows[1], delimiter)):
         return {}
@@ -343,7 +344,7 @@ def _columns(
         numbers = np.empty((0, 0))
     if numbers.shape == (len(rows), len(names)):
         return dict(zip(names, numbers.T, strict=True))
-    # Slower, cell by cell: text stays text, so that the error can name its place.
+    # Slower, cell by cell: text stays text, so that an error message can name the place.
     cells = [_cells(row, delimiter) for row in rows]
     for k, row in enumerate(cells):
         if len(row) != len(names):
@@ -365,7 +366,7 @@ def _are_numbers(cells: list[str]) -> bool:
         return False
 
 
-# A step longer than this, in median steps, has lost rows.
+# Step of the times, in median steps, above which rows are lost.
 LOST = 1.5
 
 
@@ -378,26 +379,26 @@ def resampled(
     where: str = "row",
     first: int = 1,
 ) -> tuple[float, float, Float[np.ndarray, "M D"], Float[np.ndarray, "M C"], Finding]:
-    """Signals at even times: the input as it is held, the outputs on straight lines between their samples.
+    """Signals at even times: the input is held, the outputs are interpolated linearly.
 
-    Not a cure for a clock that is wrong where a converter samples evenly: there leave the time out and give
-    the sampling period.
+    Not for wrong time stamps of a converter that samples evenly: then leave out the time and give the
+    sampling period.
 
     Args:
-        t: Times, which may repeat but not fall [s].
-        u: Input, and signals that are held as it is.
+        t: Times, which may repeat but not decrease [s].
+        u: Input, and signals that are held like the input.
         y: Outputs.
-        period: Sampling period to have [s], or "auto" for the median step.
-        label: First words of an error.
-        where: What one entry is called.
+        period: New sampling period [s], or "auto" for the median step.
+        label: First words of an error message.
+        where: Word for one entry in an error message.
         first: Number of the first entry.
 
     Returns:
-        First time and period [s], input, outputs, and what was done as a finding: a note, or a warning where
-        rows are lost.
+        First time and period [s], input, outputs, and a finding that states what was done: a note, or a
+        warning if rows are lost.
 
     Raises:
-        InputError: Times that fall or are too few, or a gap that no line should bridge.
+        InputError: The times decrease or are too few, or they have a gap that is too long to interpolate.
 
     >>> t = np.array([0.0, 0.01, 0.021, 0.03, 0.04])
     >>> _, Ts, u, y, said = resampled(t, np.arange(5.0)[:, None], 10 * t[:, None], "auto", "run.csv")
@@ -413,10 +414,10 @@ class TimedSignal(NamedTuple):
     """A signal with times of its own.
 
     Attributes:
-        t: Times, which may repeat but not fall [s].
+        t: Times, which may repeat but not decrease [s].
         x: Values.
-        held: Whether it keeps its value from one sample to the next; otherwise it follows straight lines.
-        label: First words of an error.
+        held: Whether the signal keeps its value until the next sample; otherwise it is interpolated linearly.
+        label: First words of an error message.
     """
 
     t: Float[np.ndarray, " N"]
@@ -431,19 +432,19 @@ def resampled_apart(
     where: str = "row",
     first: int = 1,
 ) -> tuple[float, float, list[Float[np.ndarray, "M _"]], Finding]:
-    """Signals with times of their own at common even times, from where all have begun to where one ends.
+    """Signals with times of their own, resampled to common even times, over the time that all have.
 
     Args:
         signals: Signals; those with the same array of times share a clock.
-        period: Sampling period to have [s], or "auto" for the longest of the median steps.
-        where: What one entry is called.
+        period: New sampling period [s], or "auto" for the longest of the median steps.
+        where: Word for one entry in an error message.
         first: Number of the first entry.
 
     Returns:
-        First time and period [s], the signals, and what was done.
+        First time and period [s], the signals, and a finding that states what was done.
 
     Raises:
-        InputError: As `resampled`, or signals that no time has in common.
+        InputError: As in `resampled`, or the signals have no time in common.
 
     >>> k = np.arange(5.0)
     >>> fast = TimedSignal(0.01 * k, k[:, None], True, "u")
@@ -493,7 +494,7 @@ def resampled_apart(
 def _checked(
     t: Float[np.ndarray, " N"], label: str, where: str, first: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Times that increase, their steps, and which of the given ones they are."""
+    """The times without repetitions, their steps, and which of the given times are kept; checked."""
     finite(t, label, where, first)
     steps = np.diff(t)
     fallen = np.flatnonzero(steps < 0)

@@ -1,10 +1,10 @@
-"""Bands around the free run of a search's result, over a recording that it may know something of.
+"""Bands around the free run of a search's result over a recording.
 
-    a search that ends unexplained and has a final fit: around the run of that fit, the model to use
+    a search that ends unexplained and has a final fit: around the run of this fit, the model to use
     otherwise:                                          of the mixture of its probable sets of effects
 
-An offset of the voltage or a bias of a sensor belongs to a run. A run that was fitted has its own; of another
-one nothing is known but how large they were in the runs that were fitted, and its band is wider by that.
+An offset of the voltage or a bias of a sensor belongs to a run. For a run that was fitted, its own values are
+known. For any other run, only the size of the offsets in the fitted runs is known, and its band is wider.
 """
 
 from collections.abc import Sequence
@@ -26,14 +26,14 @@ def bands_of_final_fit(
 ) -> Bands:
     """The band around the run of `result.model_of(recording)`.
 
-    Windows of the final fit start again every few seconds, so free runs over what was fitted say what the
-    model lacks.
+    The final fit is to windows that start again every few seconds. So free runs over the whole fitted
+    recordings show the error of the model.
 
     Args:
-        result: A search with a final fit.
-        recording: Its input, its first samples and the noise of its sensors are used.
+        result: Result of a search with a final fit.
+        recording: Recording whose input, first samples and sensor noise are used.
         level: Probability.
-        known: Recordings by which the error of the model is measured; those that were fitted if none.
+        known: Recordings by which the error of the model is measured; the fitted recordings if empty.
     """
     assert result.final_fit is not None
     fit, fitted = result.final_fit.fit, result.final_fit.recordings
@@ -60,19 +60,19 @@ def bands_of_sets(
     level: float,
     known: Sequence[Recording],
 ) -> Bands:
-    """The band of the mixture of sets of effects.
+    """The band of a mixture of sets of effects.
 
     Args:
-        result: A search.
-        fits: Its probable sets fitted to the training recordings, each with its probability.
-        recording: Its input, its first samples and the noise of its sensors are used.
+        result: Result of a search.
+        fits: Its probable sets, fitted to the training recordings, each with its probability.
+        recording: Recording whose input, first samples and sensor noise are used.
         level: Probability.
-        known: Recordings by which the error of each model is measured. Where there are none and the search
-            ends unexplained, its validation recordings.
+        known: Recordings by which the error of each model is measured. If empty and the search ended
+            unexplained, its validation recordings are used.
     """
     runs = KnownRuns.of(result.train, result.validation)
     baseline = result.baseline.model.mechanism
-    given = {(e.name, e.at) for e in baseline.effects}  # the machine's own, in `model_of` for every run
+    given = {(e.name, e.at) for e in baseline.effects}  # of the user's model, in `model_of` for every run
     calibrating = {name_prefix(port, effect) for effect, port in set(calibrations(baseline)) - given}
 
     def for_run(fit: Fit, r: Recording) -> FitForRun:
@@ -92,9 +92,9 @@ def bands_of_sets(
 
 
 def _beyond_mean(fit: Fit, own: Estimate) -> float:
-    """Variance of a run's own value beyond that of the mean over runs, which the covariance of a fit holds.
+    """Variance of a run's own value beyond the variance of the mean over runs, which the covariance has.
 
-    What the value has in common with other parameters is taken to be as in the mean.
+    Correlations of the value with other parameters are assumed to be those of the mean.
     """
     i = fit.free_names.index(own.name)
     of_mean = float(np.nan_to_num(fit.covariance[i, i]))

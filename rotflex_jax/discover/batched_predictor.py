@@ -1,4 +1,4 @@
-"""Innovations and their slopes for several parameter sets, side by side on threads."""
+"""Innovations and their slopes for several parameter sets, computed in parallel on threads."""
 
 import dataclasses
 from collections.abc import Callable
@@ -28,12 +28,12 @@ Used = TypeVar("Used")
 
 
 class ProgramSamples(NamedTuple):
-    """Recordings as programs take them: of a length that many recordings share.
+    """Recordings as inputs of compiled programs, padded to a common length.
 
     Attributes:
-        data: The recordings, zeros beyond their ends.
+        data: The recordings, with zeros beyond their ends.
         window: Window of each sample.
-        count: Samples of each recording that are run: up to the last one that counts.
+        count: Number of samples of each recording that are run, up to the last one that counts.
     """
 
     data: StackedRecordings
@@ -42,13 +42,13 @@ class ProgramSamples(NamedTuple):
 
 
 class ParameterSet(NamedTuple):
-    """What one hypothesis runs with on all recordings.
+    """Numbers with which one hypothesis runs on all recordings.
 
     Attributes:
-        values: Parameter values of each recording.
-        x0: First states of the windows of each recording, of the effects that the gates switch on.
-        gates: One factor per effect.
-        K: Gains of the predictor.
+        values: Parameter values for each recording.
+        x0: First states of the windows of each recording, for the model with the effects that are on.
+        gates: Gate of each effect.
+        K: Gains of the predictor for each recording.
     """
 
     values: Float[Any, "R P"]
@@ -61,9 +61,9 @@ class Directions(NamedTuple):
     """Directions along which the innovations of a parameter set are differentiated.
 
     Attributes:
-        values: Of the parameters of each recording.
-        x0: Of the first state, the same in every window.
-        gates: Of the gates.
+        values: Directions in the parameters of each recording.
+        x0: Directions in the first state, the same in every window.
+        gates: Directions in the gates.
     """
 
     values: Float[Any, "D R P"]
@@ -71,7 +71,7 @@ class Directions(NamedTuple):
     gates: Float[Any, "D E"]
 
     def restrict(self, model: ReducedModel) -> "Directions":
-        """Those of a reduced model."""
+        """The directions in the coordinates of a reduced model."""
         return Directions(self.values[..., model.parameters], self.x0, self.gates[:, model.effects])
 
 
@@ -104,7 +104,7 @@ def _slopes(
 
         def place(sums: Any, y_hat: jax.Array, J: jax.Array, sample: Any) -> Any:
             (k, e, slopes), (y, seen) = sums, sample
-            # Not a product: before its last sample that counts a run may diverge.
+            # `where` and not a product, since samples that do not count may be infinite.
             here, J = (jnp.where(seen > 0, a, 0.0) for a in (y - y_hat, -J.T))
             put = jax.lax.dynamic_update_slice_in_dim
             return (k + 1, put(e, here[None], k, 0), put(slopes, J[:, None], k, 1)), None
@@ -123,14 +123,14 @@ def _slopes(
 
 @dataclasses.dataclass(frozen=True)
 class BatchedPredictor:
-    """Runs hypotheses: one super-model, one solver, one set of recordings.
+    """Runs hypotheses with one super-model and one solver on one set of recordings.
 
     Attributes:
-        supermodel: What is compiled, each reduced model of it once.
+        supermodel: The super-model; each of its reduced models is compiled once.
         solver: Integration rule.
         data: The recordings.
-        constants: Values of the baseline's parameters that the recordings know, nan for the others; None
-            where they know none.
+        constants: Constants of the recordings: known values of the baseline's parameters, nan for other
+            parameters; None if there are no constants.
         compiled: Programs that have run once, and so may run on several threads.
     """
 
@@ -139,15 +139,15 @@ class BatchedPredictor:
     data: StackedRecordings
     constants: Float[np.ndarray, "R B"] | None = None
     compiled: set[Any] = dataclasses.field(default_factory=set)
-    # Samples as programs take them, by the identity of the windows, which are kept with them.
+    # Cache of `on_device`, by the identity of the windows, which are kept with the samples.
     _placed: dict[int, tuple[Any, ProgramSamples]] = dataclasses.field(
         default_factory=dict, init=False, repr=False, compare=False
     )
 
     def restrict(self, parameter_set: ParameterSet, model: ReducedModel) -> ParameterSet:
-        """A parameter set with what the recordings know, without what a reduced model leaves out.
+        """A parameter set in the coordinates of a reduced model, with the constants of the recordings.
 
-        Its windows are filled up to a number that recordings of other lengths share.
+        The number of windows is filled up, so that recordings of other lengths share programs.
         """
         values, number = parameter_set.values, parameter_set.x0.shape[1]
         filled = padded_windows(number)
@@ -174,9 +174,9 @@ class BatchedPredictor:
         parameter_sets: list[ParameterSet],
         window: Int[np.ndarray, "R N"],
     ) -> list[Used]:
-        """What a function gives for each parameter set by its number and its innovations.
+        """Results of a function of the index and innovations of each parameter set.
 
-        It is called on the thread that has run the program.
+        The function is called on the thread that has run the program.
         """
 
         def run(job: tuple[ReducedModel, int]) -> Used:
@@ -197,7 +197,8 @@ class BatchedPredictor:
     ) -> tuple[Float[np.ndarray, "L R N C"], Float[np.ndarray, "L D R N C"]]:
         """Innovations and their slopes along the directions given for each parameter set.
 
-        The number D is that of the parameter set with the most; slopes of the others end in zeros.
+        D is the largest number of directions of a parameter set; slopes of the others are filled up with
+        zeros.
         """
         found = self.of_slopes(lambda _, e, J: (e, J), parameter_sets, directions, window)
         slopes = np.zeros((len(found), max(len(d.x0) for d in directions), *self.data.y.shape))
@@ -212,9 +213,9 @@ class BatchedPredictor:
         directions: list[Directions],
         window: Int[np.ndarray, "R N"],
     ) -> list[Used]:
-        """What a function gives for each parameter set by its number, its innovations and their slopes.
+        """Results of a function of the index, innovations and slopes of each parameter set.
 
-        It is called on the thread that has run the program, and no slopes are kept.
+        The function is called on the thread that has run the program, and slopes are not kept.
         """
 
         def run(job: tuple[ReducedModel, int]) -> Used:
@@ -230,13 +231,19 @@ class BatchedPredictor:
         return self.run_jobs(run, jobs, lambda job: ("slopes", len(directions[job[1]].x0), job[0].effects))
 
     def has_innovations(self, gates: Float[np.ndarray, " E"]) -> bool:
-        """Whether innovations with what these gates switch on were run."""
+        """Whether the program of innovations of the model with these gates has run before."""
         return ("innovations", self.supermodel.active(gates).effects) in self.compiled
 
     def run_jobs(
         self, run: Callable[[Any], Any], jobs: list[Any], program: Callable[[Any], Any]
     ) -> list[Any]:
-        """Results of jobs side by side; of each new `program` (its name for a job) one job compiles first."""
+        """Results of jobs that run in parallel; of each new program, one job runs first and compiles it.
+
+        Args:
+            run: Function of a job.
+            jobs: The jobs.
+            program: Gives the name of the program that a job needs.
+        """
         names = [program(job) for job in jobs]
         new = {name: i for i, name in enumerate(names) if name not in self.compiled}
         done: dict[int, Any] = {}
@@ -246,7 +253,7 @@ class BatchedPredictor:
         return [done[i] for i in range(len(jobs))]
 
     def on_device(self, window: Int[np.ndarray, "R N"]) -> ProgramSamples:
-        """The recordings as programs take them, arrays of JAX; to be called in double precision."""
+        """The recordings as padded JAX arrays, the inputs of programs; to be called in double precision."""
         found = self._placed.get(id(window))
         if found is None:
             N, seen = window.shape[1], self.data.seen > 0

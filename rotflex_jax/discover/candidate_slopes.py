@@ -1,8 +1,8 @@
-"""Slopes of the innovations along effects that are absent: the programs, and the directions they run along.
+"""Slopes of the innovations along effects that are absent: directions, and the programs that compute slopes.
 
-Laws at ports, on the voltage and on readings are evaluated along the run of the hypothesis, whose steps are
-differentiated once for all of them (`mechanism.inactive_laws`). Effects that enter the matrices of the step
-need a program that has them in its step (`mechanism.sensitivities`).
+Laws that act at ports, on the voltage or on readings are evaluated along the run of the hypothesis. The steps
+of this run are differentiated once for all laws (`mechanism.inactive_laws`). Effects that enter the matrices
+of the integration step need a program that contains them (`mechanism.sensitivities`).
 """
 
 import dataclasses
@@ -42,9 +42,9 @@ from rotflex_jax.mechanism.sensitivities import (
 from rotflex_jax.runtime.persistent_jit import persistent_jit
 from rotflex_jax.runtime.xla import double_precision
 
-# Directions per pass where the step has the candidates in it.
+# Directions per run of a program whose integration step contains the candidates.
 PROBES_PER_BATCH = 4
-# Lines beside which a disturbance is tried, the clearest ones.
+# Largest number of lines at which a periodic disturbance is tried, the clearest ones first.
 MOST_LINES = 2
 
 
@@ -82,7 +82,7 @@ def _friction_responses(
 
 
 def _of_innovations(J: jax.Array, data: StackedRecordings) -> jax.Array:
-    """Slopes of innovations from those of predictions; zero where no sample counts."""
+    """Slopes of innovations from slopes of predictions; zero where a sample does not count."""
     return jnp.where(data.seen[None, :, :, None] > 0, -J, 0.0)
 
 
@@ -149,12 +149,12 @@ def _inactive_slopes(
 
 @dataclasses.dataclass(frozen=True)
 class Probe:
-    """One direction of the test.
+    """One direction of the score test.
 
     Attributes:
-        candidate: Along this one.
-        shape: Which of its alternatives.
-        member: Which member of the alternative.
+        candidate: The candidate to which the direction belongs.
+        shape: Index of the shape among the candidate's probes.
+        member: Index of the parameter vector within the shape.
     """
 
     candidate: Candidate
@@ -163,26 +163,26 @@ class Probe:
 
     @property
     def values(self) -> Float[np.ndarray, " p"]:
-        """Values of the candidate's parameters where it is tried: of amplitudes zero."""
+        """Values of the candidate's parameters at which slopes are computed; amplitudes are zero."""
         c = self.candidate
         return np.where(c.amplitudes, 0.0, c.probes[self.shape][0])
 
     @property
     def along(self) -> Float[np.ndarray, " p"]:
-        """Direction in these values; none where the candidate has no amplitude and is switched on."""
+        """Direction in these values; zero for a candidate without amplitudes, whose gate varies instead."""
         c = self.candidate
         return np.where(c.amplitudes, c.probes[self.shape][self.member], 0.0)
 
     @classmethod
     def of(cls, c: Candidate) -> "list[Probe]":
-        """All of a candidate, shape by shape."""
+        """All probes of a candidate, shape by shape."""
         return [cls(c, shape, k) for shape, group in enumerate(c.probes) for k in range(len(group))]
 
 
 def _packed(probes: Sequence[Probe]) -> list[list[Probe]]:
-    """Probes that share a parameter set: as many as it has directions, of each candidate one shape only."""
+    """Batches of probes that share a parameter set, with at most one shape of each candidate in a batch."""
     batches: list[list[Probe]] = []
-    # Those with most shapes need most batches, which the others fill.
+    # Candidates with most shapes need most batches, so they come first and others fill these up.
     ordered = sorted(probes, key=lambda p: -len(p.candidate.probes))
     for _, group in itertools.groupby(ordered, key=lambda p: (p.candidate.location, p.shape)):
         own = list(group)
@@ -205,12 +205,12 @@ def _with_probes(current: ParameterSet, probes: Sequence[Probe]) -> ParameterSet
 
 
 def _directions(current: ParameterSet, probes: Sequence[Probe], count: int) -> Directions:
-    """Directions of probes: along amplitudes by their values, along effects without any by the gate."""
+    """Directions of probes: in the values of amplitudes, or in the gate of an effect without amplitudes."""
     (R, P), m, E = current.values.shape, current.x0.shape[-1], len(current.gates)
     d = Directions(np.zeros((count, R, P)), np.zeros((count, m)), np.zeros((count, E)))
     for row, p in enumerate(probes):
         c = p.candidate
-        # Each recording has its own phase of a disturbance: only the one whose errors have the line counts.
+        # A disturbance has another phase in each recording: only the recording with the line counts.
         affected = slice(None) if c.line is None else c.recordings[p.shape]
         for i, size in zip(c.parameters, p.along, strict=True):
             d.values[row, affected, i] = size
@@ -219,7 +219,11 @@ def _directions(current: ParameterSet, probes: Sequence[Probe], count: int) -> D
 
 
 def _laws(own: Sequence[Sequence[Probe]]) -> InactiveLaws:
-    """Numbers of the laws of some candidates; where all shapes have as many members, these share a shape."""
+    """Values and directions of the laws of some candidates.
+
+    If all shapes of a candidate have the same number of members, the members of a shape share its values.
+    Otherwise each member has values of its own.
+    """
     values, along = [], []
     for probes in own:
         counts = {len(list(shape)) for _, shape in itertools.groupby(probes, key=lambda p: p.shape)}
@@ -234,7 +238,7 @@ class Slopes(NamedTuple):
 
     Attributes:
         probes: The directions.
-        J: Slopes along them.
+        J: Slopes along these directions.
     """
 
     probes: Sequence[Probe]
@@ -243,13 +247,13 @@ class Slopes(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class _Kinds:
-    """Candidates by how a run responds to them.
+    """Candidates by the way in which a run responds to them.
 
     Attributes:
-        laws: Laws at ports, by what they add; those of the hypothesis too, so that an effect that is found
-            compiles nothing for the others.
-        signals: What changes the voltage or a reading; those of the hypothesis too.
-        others: The rest of those that are absent.
+        laws: Kind of law -> laws at ports. Laws of the hypothesis are included, so that nothing is compiled
+            for the other candidates when an effect is found.
+        signals: Candidates that change the voltage or a reading, including those of the hypothesis.
+        others: All other candidates that are absent from the hypothesis.
     """
 
     laws: dict[str, list[Candidate]]
@@ -258,7 +262,7 @@ class _Kinds:
 
     @classmethod
     def of(cls, s: SuperModel, active: ReducedModel, solver: Solver) -> "_Kinds":
-        """Those of a super-model beside what is active."""
+        """The candidates of a super-model, given the reduced model that is active."""
         found = cls({}, [], [])
         for c in s.candidates.values():
             e, absent = s.mechanism.effects[c.effect], c.effect not in active.effects
@@ -275,7 +279,7 @@ class _Kinds:
         return found
 
     def ports(self, friction: bool) -> tuple[str, ...]:
-        """Where laws add friction levels, or torques."""
+        """Ports at which laws add friction levels, or torques."""
         of_kind = (found for kind, found in self.laws.items() if (kind == "friction") == friction)
         return tuple(sorted({c.location.port for found in of_kind for c in found}))
 
@@ -288,12 +292,12 @@ def candidate_sensitivities(
 ) -> list[Slopes]:
     """Slopes of innovations along candidates that are not active.
 
-    Programs are made for all candidates that are absent, so that a line that comes or goes compiles nothing.
+    Programs contain all absent candidates, so nothing is compiled when a line in the spectrum comes or goes.
 
     Args:
         predictor: Runs hypotheses.
-        current: The hypothesis as it is.
-        tried: What to probe, shape by shape; none of them with a threshold.
+        current: Parameter set of the hypothesis.
+        tried: Candidates to probe at all of their shapes, none of them with a threshold.
         window: Window of each sample.
     """
     s, solver = predictor.supermodel, predictor.solver
@@ -301,7 +305,7 @@ def candidate_sensitivities(
     active = s.active(current.gates)
     structure = active.mechanism.structure
     if isinstance(solver, Exponential) and solver.passes is not None:
-        # A contact without a level never sticks, so only those of the hypothesis are coupled.
+        # A contact with level zero never sticks, so only contacts of the hypothesis are coupled.
         solver = dataclasses.replace(solver, passes=min(solver.passes, Layout.of(structure).contacts + 1))
     kinds, asked = _Kinds.of(s, active, solver), {c.location: c for c in tried}
     with double_precision():
@@ -311,7 +315,7 @@ def candidate_sensitivities(
 
     def along_laws(kind: str) -> Slopes:
         family, ports = kinds.laws[kind], kinds.ports(kind == "friction")
-        # Of a candidate that is active, or not tried, as well: a place that is not looked at.
+        # Active or untried candidates are in the program too; their slopes are dropped at the end.
         own = [Probe.of(asked.get(c.location, c)) for c in family]
         listed = [p for group in own for p in group]
         effects = tuple(s.mechanism.structure.effects[c.effect] for c in family)
@@ -326,7 +330,7 @@ def candidate_sensitivities(
     def along_signals() -> Slopes:
         every = s.with_family(current.gates, kinds.signals).effects
         effects, given = s.mechanism.effects, len(s.baseline.effects)
-        # Of laws at ports those of the user's model alone, which all hypotheses share.
+        # Laws at ports are included only if they are in the user's model, which all hypotheses share.
         model = s.only(i for i in every if i < given or not effects[i].acts_at_port)
         listed = [p for c in kinds.signals if c.location in asked for p in Probe.of(asked[c.location])]
         count = sum(len(g) * (1 if c.line is None else MOST_LINES) for c in kinds.signals for g in c.probes)

@@ -1,4 +1,4 @@
-"""What a search tells while it runs: errors reached, and the state from which a stopped search goes on."""
+"""Progress of a search: errors reached, time left, and the state from which a stopped search continues."""
 
 import json
 import math
@@ -26,15 +26,15 @@ from rotflex_jax.text.numbers import as_read
 
 
 class Milestone(str):
-    """A line with the validation error of a model that was reached.
+    """A line of progress with the validation error of a model that the search has reached.
 
     Attributes:
-        label: What the model is.
+        label: Name of the model.
         errors: Channel -> error of short free runs [unit of the channel].
         floor: Channel -> noise of the sensor [unit of the channel].
         units: Channel -> unit in which people read it.
-        factors: Channel -> what its own unit is in that one.
-        kept: What a search needs to go on from this model, in plain JSON types.
+        factors: Channel -> factor from its own unit to the unit in which people read it.
+        kept: What a search needs to continue from this model, in plain JSON types.
     """
 
     kept: dict[str, Any]
@@ -52,14 +52,14 @@ def milestone(
     errors: Float[np.ndarray, " C"],
     floor: Float[np.ndarray, " C"],
 ) -> Milestone:
-    """A line with the errors that it names.
+    """A line of progress with the errors of a model.
 
     Args:
-        label: What the model is.
+        label: Name of the model.
         channels: Outputs of the model, in order.
         units: Channel -> its own unit.
-        errors: Validation error of short free runs, by channel. While a search runs, their first states
-            are fitted; its result has the errors from states estimated from the first samples alone.
+        errors: Validation error of short free runs, by channel. While a search runs, their first states are
+            fitted. The errors in its result are those of runs from states estimated from the first samples.
         floor: Noise of the sensor, by channel.
 
     >>> line = milestone("+ coulomb at hub", ["theta"], {"theta": "rad"}, np.array([0.01]), np.array([5e-4]))
@@ -79,9 +79,9 @@ def milestone(
 
 
 StepKind = Literal["baseline", "score", "refit", "pairs", "needed", "finish"]
-"""Steps of a search, each of which takes about as long as the last one of its kind."""
+"""Kinds of steps of a search; a step takes about as long as the last one of its kind."""
 
-# What follows a step if the round in which it stands is the last.
+# Steps that follow a step if its round is the last one.
 _AFTER: dict[StepKind, tuple[StepKind, ...]] = {
     "baseline": ("score", "refit", "needed", "finish"),
     "score": ("refit", "needed", "finish"),
@@ -90,36 +90,36 @@ _AFTER: dict[StepKind, tuple[StepKind, ...]] = {
     "needed": ("finish",),
     "finish": (),
 }
-# Steps that consist of refits take about as long as these where none of their kind was measured.
+# If no step of a kind was measured yet, it is assumed to take as long as a step of this other kind.
 _LIKE: dict[StepKind, StepKind] = {"pairs": "refit", "needed": "refit", "finish": "refit"}
 
 
 class BeginningStep(str):
-    """A line that says that a step of a search begins.
+    """A line of progress that announces a step of a search.
 
     Attributes:
-        kind: Which one.
+        kind: Kind of the step.
     """
 
     kind: StepKind
 
 
 def beginning(kind: StepKind, line: str) -> BeginningStep:
-    """A line with the kind of step that it announces."""
+    """A line of progress that announces a step of a kind."""
     step = BeginningStep(line)
     step.kind = kind
     return step
 
 
 class TimeLeft:
-    """How long a search goes on, from how long its own steps took; follows its lines of progress.
+    """Estimate of the time that a search still takes, from the duration of its own steps so far.
 
-    Nothing is known of a step before one of its kind was measured: the first ones compile programs, and how
-    long that takes depends on the machine. The number of rounds is not known beforehand, so the estimate is
-    for the case that this round is the last.
+    It follows the lines of progress. Before a step of a kind was measured, nothing is known of this kind: the
+    first steps compile programs, and the time for that depends on the computer. The number of rounds is not
+    known beforehand, so the estimate assumes that the present round is the last.
 
     Args:
-        clock: Seconds, from any beginning.
+        clock: Function that returns a time [s] from any origin.
     """
 
     def __init__(self, clock: Callable[[], float] = time.perf_counter) -> None:
@@ -129,7 +129,7 @@ class TimeLeft:
         self._measured: dict[StepKind, float] = {}
 
     def follow(self, line: str) -> None:
-        """Takes note of a line of progress."""
+        """Take note of a line of progress."""
         if not isinstance(line, BeginningStep):
             return
         now = self._clock()
@@ -138,10 +138,10 @@ class TimeLeft:
         self._kind, self._step_began = line.kind, now
 
     def seconds(self) -> float | None:
-        """Time left [s] if this round is the last; None where nothing measured tells it.
+        """Time left [s] if this round is the last; None where it cannot be estimated.
 
-        That is so where a step still to come is of a kind that was not measured yet, and where the present
-        one takes longer than the last one of its kind.
+        It cannot be estimated if the kind of the present step or of a following step was not measured yet, or
+        if the present step takes longer than the last one of its kind.
         """
         if self._kind is None:
             return None
@@ -158,7 +158,7 @@ class TimeLeft:
         return self._measured.get(kind, self._measured.get(_LIKE.get(kind, kind)))
 
     def words(self) -> str:
-        """Time so far, and what is left in round numbers where it can be told."""
+        """Time so far and, if it can be estimated, time left in round numbers."""
         so_far, left = f"{self._clock() - self._began:.0f} s so far", self.seconds()
         if left is None:
             usual = self._usual(self._kind) if self._kind else None
@@ -167,7 +167,7 @@ class TimeLeft:
         return f"{so_far}, {_roughly(left)} left{last}"
 
 
-# What an estimate is rounded to [s]: no more digits than it is worth.
+# Values to which an estimate is rounded [s].
 _ROUND = (5, 10, 20, 30, 45, 60, 90, 120, 180, 300, 600, 1200, 1800, 3600)
 
 
@@ -185,39 +185,43 @@ def _roughly(seconds: float) -> str:
     return f"about {nearest} s" if nearest <= 90 else f"about {nearest // 60} min"
 
 
-# What a hypothesis is made of besides the locations, all else follows from a run with these.
+# Arrays of a hypothesis that are stored; whitener, likelihood and blocks follow from a run.
 _NUMBERS = ("z", "local_z", "x0", "K")
 
 
 def digest_of_search(
     model: Model, s: SuperModel, seconds: float, train: Sequence[Recording], validation: Sequence[Recording]
 ) -> str:
-    """Digest of all that the models of a search depend on; the code of one's own effects is not among it.
+    """Digest of everything that the models of a search depend on, except the code of the user's own effects.
 
     Args:
         model: The user's model.
-        s: It with every candidate.
+        s: The super-model.
         seconds: Length of short free runs [s].
-        train: Recordings that are fitted.
-        validation: Recordings that decide; none where those for training do.
+        train: Training recordings.
+        validation: Validation recordings; empty where training recordings validate each other.
     """
     m = model.mechanism
     physics = (m.coordinates, m.ports, m.effects, m.outputs, sorted(m.trusted), m.units)
     text = repr((__version__, physics, model.solver, model.gates, s.mechanism.parameter_names, seconds))
-    # The same recordings, shared out otherwise, are another search.
+    # The same recordings, divided differently into training and validation, are another search.
     count = str(len(train)).encode()
     return digest_of(text.encode(), count, *(part for r in (*train, *validation) for part in content(r)))
 
 
 def kept(h: Hypothesis) -> dict[str, Any]:
-    """A hypothesis in plain JSON types, every number as it is."""
+    """A hypothesis in plain JSON types, with all numbers in full precision."""
     numbers = {name: getattr(h, name).tolist() for name in _NUMBERS}
     marks = {"locations": [list(p) for p in h.locations], "free": list(h.free), "local": list(h.local)}
     return {**marks, **numbers, "process_noise": dict(h.process_noise)}
 
 
 def restored(problem: LikelihoodProblem, written: Mapping[str, Any]) -> Hypothesis:
-    """The hypothesis that was written, with the whitener and the likelihood that its innovations give."""
+    """A hypothesis as written by `kept`, with the whitener and the likelihood from a new run.
+
+    Raises:
+        ValueError: If the hypothesis does not fit the problem.
+    """
     locations = tuple(EffectLocation(*map(str, p)) for p in written["locations"])
     numbers = {name: np.array(written[name], float) for name in _NUMBERS}
     h = Hypothesis(
@@ -233,7 +237,7 @@ def restored(problem: LikelihoodProblem, written: Mapping[str, Any]) -> Hypothes
 
 
 def _check(problem: LikelihoodProblem, h: Hypothesis) -> None:
-    """Raises ValueError where a hypothesis is none of this problem."""
+    """Raise ValueError if a hypothesis does not fit the problem."""
     s, R = problem.supermodel, len(problem.seen)
     on = [i for p in h.locations for i in s.parameter_indices(p)]
     if not set(h.locations) <= {*s.candidates, *s.calibrations} or sorted((*h.free, *h.local)) != sorted(
@@ -260,9 +264,9 @@ class AddedEffect(NamedTuple):
 
     Attributes:
         location: Effect and port.
-        score: The penalised score that put it forward [nat].
-        rivals: What was not distinguished from it.
-        gains: What it gained at both horizons.
+        score: Penalised score for which it was refitted [nat].
+        rivals: Effects that were not distinguished from it.
+        gains: Its gains in predictions and in free runs.
     """
 
     location: EffectLocation
@@ -291,11 +295,11 @@ class AddedEffect(NamedTuple):
 
 
 class KeptStage(NamedTuple):
-    """A model that a search has reached.
+    """A model that a search has reached, as it is stored.
 
     Attributes:
-        prediction: Fitted to predictions, as `kept` writes it.
-        free_run: Fitted to free runs.
+        prediction: The model fitted to predictions, as `kept` writes it.
+        free_run: The model fitted to free runs, as `kept` writes it.
         added: The effects that were added last; none for the baseline.
     """
 
@@ -307,7 +311,7 @@ class KeptStage(NamedTuple):
         """Plain JSON types.
 
         Args:
-            digest: Of the search.
+            digest: Digest of the search.
         """
         return {
             "digest": digest,
@@ -328,10 +332,10 @@ def read_stages(path: str | Path, digest: str) -> Sequence[KeptStage]:
 
     Args:
         path: `NAME.stopped.json`.
-        digest: Of the search that goes on.
+        digest: Digest of the search that continues.
 
     Raises:
-        InputError: No such file, or that of another search.
+        InputError: If there is no such file, or if another search has left it.
     """
     path = path_of(path)
     try:

@@ -1,13 +1,13 @@
-"""What a search concludes: the verdict, effects that only stand in for another one, the next experiment.
+"""Conclusions of a search: the verdict, signs that effects stand in for others, and the next experiment.
 
-Where the final model leaves more than sensor noise, something else is wrong with it, and an effect may have
-been added because it imitates a part of that. Three signs, none of which the search decides by:
+If the final model leaves more than sensor noise, it lacks something else, and an effect may have been added
+because it imitates a part of that. There are three signs of this, by which the search does not decide:
 
-- its size differs between the windows of the recordings: an effect of the machine has one size;
-- free runs change by it by less than half of the error that is left;
-- predictions gain less by it than they would if their errors were the sensor noise alone.
+- Its size differs between the windows of the recordings, while an effect of the machine has one size.
+- It changes free runs by less than half of the error that is left.
+- It gains less in predictions than would be gained if their errors were the sensor noise alone.
 
-In a model that explains its recordings none of them says anything: what is left there is noise.
+If a model explains its recordings, these signs mean nothing, since only noise is left.
 """
 
 import dataclasses
@@ -30,7 +30,7 @@ from rotflex_jax.experiment import Experiment, Limits, next_experiment
 from rotflex_jax.fit.coordinates import orthogonal_to
 from rotflex_jax.recording import Recording
 
-# Share of its trace in the outputs below which a candidate has next to nothing that the model cannot imitate.
+# Orthogonal fraction below which a candidate can hardly be distinguished from the model.
 IMITATED = 0.01
 
 
@@ -44,11 +44,11 @@ def end_state(
     """The verdict, and a sentence that gives its reason.
 
     Args:
-        baseline: Stage before any was added.
-        rounds: What was added.
+        baseline: Stage before any effect was added.
+        rounds: Effects that were added.
         final: Stage after the last round.
-        floor: Standard deviation of the sensor noise per channel.
-        ranking: Scores of the baseline.
+        floor: Channel -> standard deviation of the sensor noise.
+        ranking: Scores of candidates for the baseline.
     """
     end = assess_stages(baseline, final, floor)
     seconds = final.window_seconds
@@ -81,7 +81,7 @@ def end_state(
 
 
 def _imitated(visible: Sequence[Score]) -> str:
-    """Clause on candidates that the fitted parameters would hide by their values; empty where none would."""
+    """Clause on candidates that fitted parameters can imitate by other values; empty if there are none."""
     alike = [effect_phrase(*s.location) for s in visible if s.orthogonal_fraction < IMITATED]
     if not alike:
         return ""
@@ -95,12 +95,12 @@ def _imitated(visible: Sequence[Score]) -> str:
 
 Found = TypeVar("Found", bound=SearchResult)
 
-# Length of a proposal, and of the recording to which the rival is fitted [s]; a ranking needs no more.
+# Length of a proposal, and of the reference input to which the rival is fitted [s]; enough to rank inputs.
 PROPOSAL_SECONDS = 10.0
 
 
 def with_proposal(found: Found) -> Found:
-    """The result with the standard input that best distinguishes the first two that look alike, if any."""
+    """The result with the standard input that best distinguishes the first two equivalent effects, if any."""
     if found.verdict != Verdict.AMBIGUOUS:
         return found
     if found.final.model.mechanism.takes_signals:
@@ -108,16 +108,16 @@ def with_proposal(found: Found) -> Found:
         return dataclasses.replace(found, notes=(*found.notes, note))
     try:
         return dataclasses.replace(found, proposal=proposed(found, seconds=PROPOSAL_SECONDS, improve=False))
-    except InputError as error:  # no reason to lose what was found
+    except InputError as error:  # the result is returned without a proposal
         return dataclasses.replace(found, notes=(*found.notes, f"No next experiment is proposed: {error}"))
 
 
 def proposed(found: SearchResult, **changes: Any) -> Experiment | None:
-    """The next experiment for the first effect of a result that has an equal.
+    """The next experiment for the first effect of a result that has an equivalent effect; None without one.
 
     Args:
-        found: What a search found.
-        changes: Arguments of `next_experiment` to use instead of those of the recordings.
+        found: The result of a search.
+        changes: Arguments of `next_experiment` that replace the arguments from the recordings.
     """
     # The phase of a disturbance in the next recording is not known.
     phased = {name for name, effect in CATALOG.items() if effect.line}
@@ -135,12 +135,12 @@ def proposed(found: SearchResult, **changes: Any) -> Experiment | None:
         "process_noise": found.final.process_noise,
         "reference": longest.u[: round(PROPOSAL_SECONDS / longest.Ts)],
     }
-    # The model to use may have another law in the place of the first (`FinalFit.laws`).
+    # Not the model to use, in which another law may replace the first effect (`FinalFit.laws`).
     return next_experiment(found.final.model, first, second, **(settings | changes))
 
 
 def seen_limits(recordings: tuple[Recording, ...]) -> Limits:
-    """What the machine has borne already: largest voltage, slew and deflection of the recordings."""
+    """Limits that the machine has withstood: largest voltage, slew rate and deflection of the recordings."""
     r = max(recordings, key=lambda r: float(np.max(np.abs(r.u))))
     slew = max(float(np.max(np.abs(np.diff(r.u)))) / r.Ts for r in recordings)
     deflection = max(float(np.max(np.abs(r.y[:, -1]))) for r in recordings)
@@ -153,19 +153,19 @@ def seen_limits(recordings: tuple[Recording, ...]) -> Limits:
     )
 
 
-# Root mean square of the change of size between windows, over the size, that an effect of the machine stays
-# below, and least root mean square that it changes free runs by, over the error that is left.
+# Limits for an effect of the machine: largest root mean square change of its size between windows, over the
+# size; least root mean square change of free runs by it, over the error that is left.
 SCATTER, LEAST_CHANGE = 0.15, 0.5
-# Beyond these a scatter or a change has no size that a reader could use.
+# A larger scatter or a smaller change than this is not written as a number.
 MOST_WRITTEN, LEAST_WRITTEN = 10.0, 0.01
 
 
 class WindowSizes(NamedTuple):
-    """An effect in the windows of free runs.
+    """Consistency of the size of an effect over the windows of free runs.
 
     Attributes:
-        scatter: Root mean square change of its size that the windows ask for one by one, over its size.
-        change: Root mean square of what it changes in the errors, over what is left of them.
+        scatter: Root mean square change of its size if it is fitted to each window alone, over its size.
+        change: Root mean square change of the errors by the effect, over the error that is left.
     """
 
     scatter: float
@@ -175,18 +175,19 @@ class WindowSizes(NamedTuple):
 def window_sizes(
     problem: LikelihoodProblem, h: Hypothesis, locations: Sequence[EffectLocation]
 ) -> dict[EffectLocation, WindowSizes]:
-    """Whether effects have the same size in all windows of some recordings.
+    """How consistent the sizes of effects are over the windows of some recordings.
 
     In each window the amplitudes `a` of an effect are fitted to the whitened errors `w` by one Gauss-Newton
-    step `d`, with slopes `J` of which the first state and the recording's own parameters are projected out,
-    and all other parameters held. The scatter is the root of `sum |J d|^2 / sum |J a|^2`, the change that of
-    `sum |J a|^2 / sum |w|^2`; a window counts by what the effect does there.
+    step `d`. The first state and the local parameters are projected out of the slopes `J`, and all other
+    parameters are held. The scatter is the root of `sum |J d|^2 / sum |J a|^2`, the change is the root of
+    `sum |J a|^2 / sum |w|^2`. So the weight of a window is the size of what the effect does there.
 
     Args:
-        problem: Free runs over the recordings.
-        h: Fitted to them, or to others. Windows in which its run diverges say nothing.
-        locations: Effects of `h`; those without an amplitude, and those with values for each recording, are
-            left out.
+        problem: Likelihood of free runs over the recordings.
+        h: Hypothesis fitted to these recordings, or to others. Windows in which its run diverges are left
+            out.
+        locations: Effects of `h`. Effects without an amplitude, and effects with values for each recording,
+            are left out.
     """
     s, seen = problem.supermodel, problem.seen
     e, J = problem.slopes([h])
@@ -221,19 +222,19 @@ def window_sizes(
 
 
 def nats_above_noise(problem: LikelihoodProblem, h: Hypothesis) -> float:
-    """What predictions would gain if their errors were the sensor noise alone [nat].
+    """Log-likelihood that predictions would gain if their errors were the sensor noise alone [nat].
 
-    `N log(rms / noise)`, summed over the channels whose error is above the noise.
+    It is `N log(rms / noise)`, summed over the channels whose error is above the noise.
     """
     multiples = np.maximum(problem.channel_errors(h) / problem.noise, 1.0)
     return float(np.sum(problem.seen > 0) * np.sum(np.log(multiples)))
 
 
 def nats_left(prediction: SearchHorizon, final: ValidatedHypothesis) -> float:
-    """What is left above the sensor noise in training and validation data together [nat].
+    """Sum of `nats_above_noise` over training and validation data [nat].
 
     Args:
-        prediction: The recordings.
+        prediction: The recordings, for predictions.
         final: The model, fitted to predictions.
     """
     rest = nats_above_noise(prediction.problem, final.hypothesis)
@@ -247,12 +248,12 @@ def signs(
     final: ValidatedHypothesis,
     gains: dict[EffectLocation, float],
 ) -> dict[EffectLocation, tuple[str, ...]]:
-    """Effects of an unexplained model -> why each may stand in for something else, in words.
+    """Effects of an unexplained model -> signs that each may stand in for something else, in words.
 
     Args:
-        horizons: Predictions and free runs.
-        final: The model, fitted and validated at both.
-        gains: Effects that were added -> what predictions of training and validation data gained [nat].
+        horizons: The recordings for predictions and for free runs.
+        final: The model, fitted and validated at both horizons.
+        gains: Effects that were added -> gain of predictions of training and validation data [nat].
     """
     prediction, free_run = horizons
     runs, rest = final.free_run, nats_left(prediction, final)

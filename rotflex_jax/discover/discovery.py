@@ -53,11 +53,11 @@ LISTED_CANDIDATES = 8
 
 @dataclasses.dataclass(frozen=True)
 class Discovery(SearchResult):
-    """What a search found, with its report, the torques that are missing, and the next experiment."""
+    """The result of a search, with its report, the torques that are missing, and the next experiment."""
 
     @functools.cached_property
     def _fits(self) -> list[tuple[Fit, float]]:
-        """Filled by the first call of `_probable_fits`."""
+        """Cache, filled by the first call of `_probable_fits`."""
         return []
 
     def __str__(self) -> str:
@@ -66,7 +66,7 @@ class Discovery(SearchResult):
     def latent_torque(self, progress: Callable[[str], None] | None = None) -> LatentTorqueComparison:
         """Torques that the baseline and the final model lack, on a fitted and a validation recording."""
         groups = (self.train, self.validation) if self.validation != self.train else (self.train,)
-        if self.final.of_validation:  # the model has the phase of the first recording
+        if self.final.of_validation:  # the model has the phase that a disturbance has in the first recording
             groups = (self.train[:1],)
         longest = [max(group, key=lambda r: r.N) for group in groups]
         return compare_latent_torques(self.baseline, self.final if self.rounds else None, longest, progress)
@@ -74,23 +74,23 @@ class Discovery(SearchResult):
     def learned_torque(
         self, at: str = "hub", progress: Callable[[str], None] | None = None
     ) -> LearnedTorqueResult:
-        """A smooth map of position and speed learned on top of the final model, for what is unexplained.
+        """Learn a torque as a smooth map of position and speed, in addition to the final model.
 
         Args:
             at: Port of the torque.
             progress: Called with a line of text at each stage.
         """
-        seconds, m = self.baseline.window_seconds, self.final.model.mechanism  # saw no validation recording
-        for effect in [e for e in m.effects if e.line]:  # its phase is that of one recording
+        seconds, m = self.baseline.window_seconds, self.final.model.mechanism  # not fitted to validation data
+        for effect in [e for e in m.effects if e.line]:  # its phase belongs to one recording
             m = m.without(effect.name, effect.at)
         model = Model(m, self.final.model.solver)
         return learn_torque(model, self.train, self.validation, at, window_seconds=seconds, progress=progress)
 
     def identifiability(self) -> Identifiability | None:
-        """What sensors and the longest fitted recording determine of the final model, at its parameters.
+        """Identifiability of the model to use from its sensors and the longest training recording.
 
-        The noise of the sensors counts alone, which is the best case. None where nothing is free, or where
-        runs of other parameters diverge.
+        It assumes that sensor noise is the only error, which is the best case. None if no parameter is free,
+        or if runs with other parameters diverge.
         """
         longest = max(self.train, key=lambda r: r.N)
         shown = longest.slice(0, min(longest.N, round(SHOWN_SECONDS / longest.Ts)))
@@ -102,11 +102,11 @@ class Discovery(SearchResult):
     def explanation(
         self, learned: bool | None = None, progress: Callable[[str], None] | None = None
     ) -> Explanation:
-        """Everything that a report needs beyond the search itself; takes about a minute.
+        """Compute everything that a report needs beyond the search itself, which takes about a minute.
 
         Args:
-            learned: Whether to learn a torque at the port where most is left; where the verdict is
-                `unexplained` if None.
+            learned: Whether to learn a torque at the port where most is left; if None, it is learned if the
+                verdict is `unexplained`.
             progress: Called with a line of text at each stage.
         """
         say = checks.progress(progress)
@@ -116,7 +116,7 @@ class Discovery(SearchResult):
             gains = (latent.after or latent.before).gain_nats
             try:
                 torque = self.learned_torque(max(gains, key=lambda port: gains[port]), progress)
-            except InputError:  # no sensor tells how that port moves
+            except InputError:  # the sensors do not determine the motion of that port
                 torque = None
         say("report: tests of the residuals and frequency responses")
         tests = model_tests(self)
@@ -138,18 +138,18 @@ class Discovery(SearchResult):
     ) -> Bands:
         """Bands around the free run of `model_of(recording)`, or of the probable sets of effects.
 
-        Where a search ends unexplained and has a final fit, bands are of that fit, and what it lacks is as
-        large as free runs over the fitted recordings show it. Otherwise the probable sets are fitted to the
-        training recordings, once, and weigh as much as they are probable; of a search without probabilities
-        the final model counts alone. That none of the sets is right is in the bands of a search that ends
-        unexplained, by its validation recordings, and wherever recordings are `known`.
+        If the search ended unexplained and has a final fit, bands are around the run of this fit. The error
+        of the model is measured by free runs over the fitted recordings. Otherwise the probable sets are
+        fitted to the training recordings, once, and have their probabilities as weights. If the search has no
+        probabilities, the final model is the only one. The error of these models is included if recordings
+        are `known`, or, if the search ended unexplained, by its validation recordings.
 
-        A run that was not fitted has offsets and biases of its own in the place of those that single runs
-        have shown, about as large.
+        A run that was not fitted has offsets and biases of its own. For offsets that only single runs have
+        shown, bands allow values of about the same size.
 
         Args:
-            recording: Its input, its first samples and the noise of its sensors are used, its other samples
-                only by `coverage`.
+            recording: Recording whose input, first samples and sensor noise are used; other samples are used
+                by `coverage` only.
             level: Probability, between 0 and 1.
             known: Recordings by which the error of models is measured, see `rotflex_jax.prediction_bands`.
             progress: Called with a line of text at each fit of a set.
@@ -164,7 +164,7 @@ class Discovery(SearchResult):
         return bands_of_sets(self, self._probable_fits(say), recording, level, others)
 
     def _probable_fits(self, say: Callable[[str], None]) -> list[tuple[Fit, float]]:
-        """Probable sets of effects with their probabilities, fitted to the training recordings once."""
+        """Probable sets of effects, fitted to the training recordings once, with their probabilities."""
         if not self._fits:
             fits, share = (
                 models_of(self, say) if self.probabilities else ({"": fit(self.model, self.train)}, None)
@@ -173,10 +173,10 @@ class Discovery(SearchResult):
         return self._fits
 
     def next_experiment(self, **changes: Any) -> Experiment | None:
-        """Design the input that distinguishes the first effect found from its equal; None where it has none.
+        """Design the input that distinguishes the first ambiguous effect from its equivalent; or None.
 
-        The model, its noise and the machine's limits are those of the recordings: no more voltage, slew or
-        deflection than they hold.
+        Noise and limits come from the recordings: voltage, slew rate and deflection exceed none that they
+        hold.
 
         Args:
             changes: Other arguments of `rotflex_jax.next_experiment`, its `limits` for instance.
@@ -192,18 +192,18 @@ class Discovery(SearchResult):
     ) -> Path:
         """Write `report.html` (self-contained) and `result.json` into a folder; returns the HTML path.
 
-        Where the verdict is ambiguous, the input to play next lies beside them as a file.
+        If the verdict is ambiguous, the input of the next experiment is written beside them as a file.
 
         Args:
-            folder: Where to write.
-            learned: Whether to learn a torque for what is left, which takes about as long as a round; where
-                the verdict is `unexplained` if None.
+            folder: Folder to write to.
+            learned: Whether to learn a torque for what is left, which takes about as long as a round; if
+                None, it is learned if the verdict is `unexplained`.
             progress: Called with a line of text at each stage.
         """
         from rotflex_jax.report import write_report  # the layer above, on request
 
         folder = Path(folder)
-        # First of all, so that whatever fails below costs nothing of the result.
+        # The result is written first, so that it is kept whatever fails below.
         write_files(folder, {"result.json": as_json(self.to_dict())})
         explanation = self.explanation(learned, progress)
         checks.progress(progress)("report: drawing figures")
@@ -213,9 +213,9 @@ class Discovery(SearchResult):
         return page
 
     def _repr_html_(self) -> str:
-        """Verdict, errors of each model, what each round found, and where the baseline failed.
+        """A card with verdict, errors of each model, effects of each round, and failures of the baseline.
 
-        Parameters are those of the model to use.
+        Parameters are the parameters of the model to use.
         """
         scale = {c: readable(1.0, unit) for c, unit in channel_units(self).items()}
         heading = {c: f"{c} [{read}]" for c, (_, read) in scale.items()}

@@ -1,6 +1,6 @@
-"""Reported of fitted models: errors of free runs, with and without a run's own offsets, and estimates.
+"""Evaluation of fitted models: errors of free runs, with and without the own offsets of a run, and estimates.
 
-No choice of effects rests on anything here.
+No choice of effects depends on this module.
 """
 
 import dataclasses
@@ -35,38 +35,40 @@ from rotflex_jax.parameters import Estimate
 from rotflex_jax.recording import Recording
 from rotflex_jax.runtime.persistent_jit import make_ahead
 
-# Amplitudes of an effect that differ by no more than this share are alike, however narrow their intervals.
+# Two estimates agree if they differ by no more than this share, however narrow their intervals are.
 SAME_SIZE = 0.25
-# How often the offsets of a recording are fitted, each time with the size of the errors that are left.
+# Largest number of fits of the offsets of a recording; each uses the size of the errors that the last one
+# left.
 CALIBRATIONS = 8
 
 
 def calibrate(problem: LikelihoodProblem, h: Hypothesis, seconds: float) -> Hypothesis:
-    """A trained hypothesis with the offsets that the beginning of each recording gives.
+    """A trained hypothesis with offsets that are fitted to the beginning of each recording.
 
     Offsets belong to a run, not to the machine: an amplifier's offset of 0.04 V moves a servo by degrees
-    within seconds. Free runs over the first seconds determine them, together with the first state, while all
-    else is as trained. Errors of a free run are alike for half a second or so: a block of that length counts
-    as one measurement against what offsets usually are. The recordings share the size of their errors, and a
-    recording no longer than these seconds has nothing left to compare its offsets with.
+    within seconds. They are fitted to free runs over the first seconds, together with the first state, while
+    everything else keeps its trained value. A prior has the usual size of offsets. Errors of a free run are
+    correlated over about half a second, so a block of this length counts as one measurement against the
+    prior. The size of the errors is common to all recordings. For a recording no longer than `seconds`, no
+    data are left on which the offsets could be tested.
 
     Args:
-        problem: Free runs over recordings that the hypothesis was not fitted to.
-        h: Trained.
-        seconds: How much of each recording may be used [s].
+        problem: Likelihood of free runs over recordings to which the hypothesis was not fitted.
+        h: Trained hypothesis.
+        seconds: Length of the part of each recording that is used [s].
     """
     start = with_all_calibrations(problem.supermodel, carried_over(problem, h))
     early = problem.first_seconds(seconds)
     prior = BLOCK_SECONDS / np.asarray(problem.dataset.data.Ts)
     own = start
-    # Errors that an offset makes are no measure of how well it is determined.
+    # Errors caused by an offset do not measure how well it is determined: the size of errors is updated.
     for _ in range(CALIBRATIONS):
         own = early.with_likelihood(own)
         if not np.isfinite(own.log_likelihood):
             return start
         before, own = own, adapted_to_recordings(early, own, prior)
         if np.array_equal(own.x0, before.x0) and np.array_equal(own.local_z, before.local_z):
-            break  # as every further fit would
+            break  # further fits would change nothing either
     return own
 
 
@@ -75,8 +77,8 @@ class FreeRuns(NamedTuple):
 
     Attributes:
         whole: One run over each recording.
-        windows: The same, started again every few seconds.
-        errors: Of both.
+        windows: Runs over each recording that start again every few seconds.
+        errors: Errors of both.
     """
 
     whole: tuple[Float[np.ndarray, "_ C"], ...]
@@ -85,7 +87,7 @@ class FreeRuns(NamedTuple):
 
 
 def free_runs(validation: ValidationSet, models: Sequence[Model]) -> FreeRuns:
-    """Free runs of models over the recordings of a set, one model for each."""
+    """Free runs over the recordings of a validation set, with one model for each recording."""
     recordings, channels = validation.problem.dataset.recordings, models[0].mechanism.channels
     pairs = list(zip(models, recordings, strict=True))
     whole = tuple(m.simulate(r) for m, r in pairs)
@@ -103,13 +105,14 @@ def errors_with_own_calibration(
     locations: Sequence[EffectLocation],
     seconds: float,
 ) -> RunErrors:
-    """Errors over recordings where each has the offsets that its own first seconds give.
+    """Errors of free runs with the offsets of each recording fitted to its own first seconds.
 
     Args:
         validation: Free runs over the recordings.
-        trained: One for all recordings, or one for each: without it, or with what is known of its run.
-        locations: What its model has.
-        seconds: How much of each recording its offsets may be fitted to [s].
+        trained: One hypothesis for all recordings; or one for each, which is fitted without it, or which has
+            what is known of its run.
+        locations: Effects of the model; all calibrations are added.
+        seconds: Length of the part of each recording to which its offsets are fitted [s].
     """
     problem = validation.problem
     on = list(dict.fromkeys([*locations, *problem.supermodel.calibrations]))
@@ -123,7 +126,13 @@ def errors_with_own_calibration(
 def errors_as_trained(
     validation: ValidationSet, trained: Sequence[Hypothesis], locations: Sequence[EffectLocation]
 ) -> RunErrors:
-    """Errors over recordings with the trained model as it is, less a disturbance; arguments as before."""
+    """Errors of free runs with trained parameters and without periodic disturbances.
+
+    Args:
+        validation: Free runs over the recordings.
+        trained: One hypothesis for all recordings, or one for each.
+        locations: Effects of the model.
+    """
     s = validation.problem.supermodel
     means = [_with_own_values(s, h, h.local_z.mean(axis=0, keepdims=True)) for h in trained]
     each = _for_each(means, len(validation.problem.dataset.recordings))
@@ -131,12 +140,12 @@ def errors_as_trained(
 
 
 def _for_each(trained: Sequence[Hypothesis], count: int) -> Sequence[Hypothesis]:
-    """A hypothesis for each of some recordings; of one for all, that."""
+    """One hypothesis for each recording; a single one is repeated."""
     return [trained[0]] * count if len(trained) == 1 else trained
 
 
 def _with_own_values(s: SuperModel, h: Hypothesis, local_z: Float[np.ndarray, "R L"]) -> Hypothesis:
-    """A trained hypothesis for R recordings with these local values, less a disturbance; for models of it."""
+    """A trained hypothesis for R recordings with given local values and no disturbance; for `model_of`."""
     return dataclasses.replace(
         h,
         local_z=local_z * [i not in s.phased for i in h.local],
@@ -154,18 +163,18 @@ def errors_on_test(
     runs: KnownRuns,
     of_runs: Sequence[EffectLocation] = (),
 ) -> RunErrors:
-    """Errors over test recordings, each with the offsets that are known of its run.
+    """Errors of free runs over test recordings, each with the offsets that are known of its run.
 
-    A recording of a run that was fitted has the offsets of that run. One of another run has those that the
-    machine has, and none that a single run has shown; nor the phase of a disturbance.
+    A recording of a run that was fitted has the offsets of that run. A recording of another run has only the
+    offsets of the machine, and no offsets that a single run has shown. Periodic disturbances are left out.
 
     Args:
-        test: The recordings.
-        trained: One for all recordings, or one for each, with what else is known of its run.
-        own: Unconstrained values of its local parameters in each of the fitted recordings.
-        locations: What its model has.
+        test: Free runs over the test recordings.
+        trained: One hypothesis for all recordings; or one for each, with what is known of its run.
+        own: Unconstrained values of the local parameters in each of the fitted recordings.
+        locations: Effects of the model.
         runs: The fitted recordings.
-        of_runs: What the model has for recordings of the fitted runs besides.
+        of_runs: Further calibrations that the model has for recordings of the fitted runs.
     """
     s, recordings, models = test.problem.supermodel, test.problem.dataset.recordings, []
     machine = [p for p in locations if runs.compared or p not in s.calibrations]
@@ -183,15 +192,15 @@ def evaluate(
     validated: ValidatedHypothesis,
     locations: Sequence[EffectLocation],
 ) -> Stage:
-    """What is reported of a hypothesis: estimates with intervals, its free runs and their errors.
+    """Evaluate a hypothesis for the report: estimates with intervals, free runs and their errors.
 
     Args:
-        problem: With the training recordings.
+        problem: Likelihood of the training recordings.
         validation: The validation recordings.
-        solver: Of the model that a user gets.
+        solver: Integration rule of the model that a user gets.
         validated: The hypothesis with its validation likelihood.
-        locations: What the stage's model has; calibrations that belong to the training recordings alone
-            are in the hypothesis, but not here.
+        locations: Effects of the stage's model. Calibrations that belong to the training recordings alone are
+            in the hypothesis, but not among them.
     """
     h, s = validated.hypothesis, problem.supermodel
     trained = validated.with_trained_calibrations(s)
@@ -217,10 +226,10 @@ def evaluate(
 
 
 def process_noise_gain(problem: LikelihoodProblem, h: Hypothesis) -> float:
-    """Log-likelihood per measured value that process torques gain over a free run [nat].
+    """Log-likelihood per measured value that process noise gains over a free run [nat].
 
-    The parameters are the same. The free run has the least process torques, a share of those of the motor as
-    it was fitted: the values that a user starts from do not matter.
+    Both have the same parameters. The free run has the least process noise, which is relative to the fitted
+    torque of the motor, so the values given by the user do not matter.
     """
     least = dict.fromkeys(problem.ports, problem.least_process_noise(h))
     free_run = problem.with_process_noise(h, least)
@@ -229,7 +238,7 @@ def process_noise_gain(problem: LikelihoodProblem, h: Hypothesis) -> float:
 
 
 def estimates(problem: LikelihoodProblem, h: Hypothesis) -> tuple[Estimate, ...]:
-    """Parameters of the baseline and of what was added, intervals robust to correlated residuals."""
+    """Estimates of all parameters of a hypothesis, with intervals that allow for correlated residuals."""
     s, seen = problem.supermodel, problem.seen
     e, J = problem.slopes([h])
     w = h.whitener(e[0], seen)
@@ -245,7 +254,7 @@ def estimates(problem: LikelihoodProblem, h: Hypothesis) -> tuple[Estimate, ...]
     def combination(i: int) -> Combination | None:
         if i in h.free:
             return Combination([h.free.index(i)], derivative[:1, i])
-        if i in h.local and i in s.phased:  # as the model has it: phases have no mean
+        if i in h.local and i in s.phased:  # first recording, as in the model: phases have no mean
             return Combination([int(coordinates.local_columns(0)[h.local.index(i)])], derivative[:1, i])
         if i in h.local:
             return Combination(
@@ -273,10 +282,10 @@ def estimates(problem: LikelihoodProblem, h: Hypothesis) -> tuple[Estimate, ...]
 def differing(
     training: Sequence[Estimate], validation: Sequence[Estimate]
 ) -> list[tuple[Estimate, Estimate]]:
-    """Parameters that are not the same in two sets of recordings.
+    """Parameters whose estimates from two sets of recordings disagree.
 
-    They agree where their difference lies within two of its standard deviations, or where it is no more than
-    `SAME_SIZE` of the larger one: intervals of an incomplete model are too narrow.
+    Two estimates agree if their difference is within two of its standard deviations, or if it is no more than
+    the share `SAME_SIZE` of the larger one, since intervals of an incomplete model are too narrow.
 
     Args:
         training: Estimates from the training recordings.
@@ -295,12 +304,12 @@ def differing(
 
 
 class PairedEstimates(NamedTuple):
-    """One model fitted twice, to recordings that have nothing in common.
+    """Estimates of one model that was fitted twice, to recordings that have nothing in common.
 
     Attributes:
-        training: Estimates from some recordings.
-        other: Estimates from others.
-        where: The others, in words.
+        training: Estimates from the first recordings.
+        other: Estimates from the other recordings.
+        where: The other recordings, in words.
     """
 
     training: Sequence[Estimate]
@@ -309,11 +318,11 @@ class PairedEstimates(NamedTuple):
 
 
 def disagreement(pairs: Sequence[PairedEstimates], location: EffectLocation) -> str:
-    """Why the size of an effect is not known to be the same in all recordings, in words; empty if it is.
+    """A clause that the size of an effect differs between recordings, or is not determined; else empty.
 
     Args:
-        pairs: Fits to compare.
-        location: The effect; one that has a value for each recording is no property of the machine.
+        pairs: Pairs of fits to compare.
+        location: The effect; for an effect with a value for each recording, the clause is empty.
     """
     head, kind = location.name_prefix, CATALOG[location.effect]
     if kind.per_recording or not kind.amplitudes:
@@ -332,11 +341,11 @@ def disagreement(pairs: Sequence[PairedEstimates], location: EffectLocation) -> 
 
 
 def difference_notes(s: SuperModel, pairs: Sequence[PairedEstimates]) -> tuple[str, ...]:
-    """What of the machine differs between recordings beyond its intervals, in sentences.
+    """Sentences on parameters of the machine that differ between recordings by more than their intervals.
 
     Args:
-        s: Its calibrations, and effects with a value for each recording, are left out.
-        pairs: Fits to compare.
+        s: The super-model, whose calibrations and effects with a value for each recording are left out.
+        pairs: Pairs of fits to compare.
     """
     own = {s.mechanism.parameter_names[i] for i in s.local}
     for effect in s.mechanism.effects:
@@ -359,13 +368,13 @@ def own_estimates(stage: Stage, location: EffectLocation) -> dict[str, Estimate]
 
 @dataclasses.dataclass(frozen=True)
 class Evaluation:
-    """Recordings on which finished models are evaluated, with and without offsets of their own.
+    """Recordings on which final models are evaluated, with and without offsets of their own.
 
     Attributes:
         validation: Free runs over the validation recordings.
-        test: Free runs over test recordings; None without any.
-        calibrate_seconds: How much of a recording its own offsets may be fitted to [s].
-        runs: Those of the training recordings.
+        test: Free runs over test recordings; None without test recordings.
+        calibrate_seconds: Length of the part of a recording to which its own offsets are fitted [s].
+        runs: The runs of the training recordings.
     """
 
     validation: ValidationSet
@@ -377,10 +386,10 @@ class Evaluation:
     def of(
         cls, model: Model, horizons: Horizons, test: Sequence[Recording], calibrate_seconds: float
     ) -> "Evaluation":
-        """What the recordings of a search and further ones are evaluated with.
+        """The evaluation on the recordings of a search and on test recordings.
 
         Raises:
-            InputError: A recording without a channel of the model or against its signs.
+            InputError: If a recording lacks a channel of the model, or moves against the signs of the model.
         """
         validation, other = horizons.free_run.validation, None
         if test:
@@ -397,11 +406,11 @@ class Evaluation:
         return cls(validation, other, calibrate_seconds, runs)
 
     def make_ahead(self, found: ValidatedHypothesis, longest: Recording) -> None:
-        """Have the programs made that evaluating nested models will need.
+        """Compile in advance the programs that the evaluation of nested models needs.
 
         Args:
-            found: Has the effects that the largest of them will have, as far as is known.
-            longest: The recording over which errors of the model as it is are localised.
+            found: A model with the effects that the largest of the nested models will have, as far as known.
+            longest: The recording on which errors of the baseline are localised.
         """
         h, s, seconds = found.adapted, self.validation.problem.supermodel, self.validation.window_seconds
         built = self.with_built_in(frozenset(s.calibrations).union(h.locations)).validation
@@ -410,7 +419,7 @@ class Evaluation:
         make_ahead(model.simulate_windows, longest, seconds)
 
     def with_built_in(self, effects: frozenset[EffectLocation]) -> "Evaluation":
-        """The same with models that all have these effects, on or off, and so share their programs."""
+        """The same evaluation with models that all contain these effects, on or off, to share programs."""
         return dataclasses.replace(
             self,
             validation=dataclasses.replace(self.validation, built_in=effects),
@@ -425,12 +434,12 @@ class Evaluation:
     def of_stage(
         self, stage: Stage, validated: ValidatedHypothesis, locations: Sequence[EffectLocation]
     ) -> Stage:
-        """A stage with the errors on test recordings, and with the calibrated ones.
+        """A stage with its errors on test recordings, and with calibrated errors.
 
         Args:
-            stage: With the errors on validation recordings.
-            validated: Its parameters.
-            locations: What its model has.
+            stage: The stage with its errors on validation recordings.
+            validated: The hypothesis of the stage.
+            locations: Effects of the model of the stage.
         """
         h, found = validated.hypothesis, dict[str, Any](calibrate_seconds=self.calibrate_seconds)
         if self.calibrate_seconds:
@@ -449,10 +458,11 @@ class Evaluation:
 def paired_estimates(
     horizon: SearchHorizon, found: ValidatedHypothesis, trained: Sequence[Estimate]
 ) -> tuple[PairedEstimates, ...]:
-    """The parameters of a model fitted to the training and, from there, to the validation recordings.
+    """Estimates of a model from the training recordings and from the validation recordings.
 
-    What agrees is a property of the machine. Where runs validate each other, each is fitted alone and
-    compared with the fit to the others. No choice of effects rests on these fits.
+    The fit to the validation recordings starts from the trained parameters. Parameters that agree are
+    properties of the machine. Where runs validate each other, each is fitted alone and compared with the fit
+    to the others. No choice of effects depends on these fits.
 
     Args:
         horizon: The recordings.
@@ -471,7 +481,7 @@ def paired_estimates(
 
 
 def _fitted_to(problem: LikelihoodProblem, start: Hypothesis) -> tuple[Estimate, ...]:
-    """Estimates from the recordings of a problem; none where the start diverges there."""
+    """Estimates from a fit to the recordings of a problem; none if the start diverges there."""
     begun = problem.with_likelihood(start)
     if not np.isfinite(begun.log_likelihood):
         return ()

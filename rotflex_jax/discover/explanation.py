@@ -1,4 +1,4 @@
-"""What a report needs beyond the search: residual tests, frequency responses, missing and learned torques."""
+"""Results for a report beyond the search: residual tests, frequency responses, latent and learned torques."""
 
 import dataclasses
 import math
@@ -29,13 +29,14 @@ from rotflex_jax.text.numbers import plain_number
 
 @dataclasses.dataclass(frozen=True)
 class ModelTests:
-    """What the longest validation recording says of the baseline and of the final model.
+    """Tests of the baseline and of the final model on the longest validation recording.
 
     Attributes:
-        recording: Which it is.
-        residuals: Name of the model -> tests of its innovations, what one-step predictions leave.
-        measured: Response of the measured outputs to the input.
-        simulated: Name of the model -> the same estimate of its free run.
+        recording: The longest validation recording.
+        residuals: Name of the model -> tests of its innovations, which are the errors of one-step
+            predictions.
+        measured: Frequency response from the input to the measured outputs.
+        simulated: Name of the model -> frequency response from the input to the outputs of its free run.
     """
 
     recording: Recording
@@ -47,8 +48,8 @@ class ModelTests:
 def model_tests(found: SearchResult) -> ModelTests:
     """Residual tests and frequency responses of the baseline and the final model.
 
-    Residuals are those of predictions, with the process noise that the data ask for: where a model is right
-    they are white and independent of the input. Frequency responses are of free runs over the recording.
+    Residuals are innovations of predictions with the likeliest process noise: if a model is right, they are
+    white and independent of the input. Frequency responses are estimated from free runs over the recording.
     """
     i = found.longest_validation
     recording = found.validation[i]
@@ -67,7 +68,7 @@ def model_tests(found: SearchResult) -> ModelTests:
 
 
 def _innovations(found: SearchResult, stage: Stage, i: int) -> ResidualTests | None:
-    """Tests of a stage's innovations over validation recording `i`; None where its predictions run away."""
+    """Tests of a stage's innovations over validation recording `i`; None if they diverge or are few."""
     recording, model = found.validation[i], stage.model_on(i)
     channels, m = model.mechanism.channels, recording.n_init
     noise = [found.noise_floor.get(c) or stage.held_out_rmse_windows[c] for c in channels]
@@ -78,17 +79,18 @@ def _innovations(found: SearchResult, stage: Stage, i: int) -> ResidualTests | N
     return residual_tests(e, recording.u[m:].astype(float), recording.Ts, channels)
 
 
-# Of a long recording only so much is smoothed [s].
+# Length of the part of a recording from which latent torques are estimated [s].
 SHOWN_SECONDS = 30.0
 
 
 @dataclasses.dataclass(frozen=True)
 class LatentTorqueComparison:
-    """Latent torques of the same recordings.
+    """Latent torques of the baseline and of the final model over the same recordings.
 
     Attributes:
-        before: What the baseline lacks.
-        after: What the final model lacks; None where nothing was added, or where it has play in a gear.
+        before: Torques that the baseline lacks.
+        after: Torques that the final model lacks; None if nothing was added, or if an effect of the final
+            model has no slope at zero, such as play in a gear.
     """
 
     before: LatentTorque
@@ -96,7 +98,7 @@ class LatentTorqueComparison:
 
     @property
     def sentences(self) -> list[str]:
-        """How large the torques are that the models lack, and what they do in time."""
+        """Sentences on the size of the torques that the models lack, and on their behaviour in time."""
         lines = []
         for port in self.before.ports:
             line = f"At the {port} the baseline lacks {self._size(self.before, port)}"
@@ -122,7 +124,7 @@ class LatentTorqueComparison:
         return "\n".join([head, *(f"  {line}" for line in (*self.sentences, largest))])
 
     def _size(self, torque: LatentTorque, port: str) -> str:
-        """Size of a torque in words, beside that of the motor under the baseline."""
+        """Size of a torque in words, also as a percentage of the motor's torque in the baseline."""
         size, scale = torque.size(port), self.before.scale
         if size < 1e-3 * scale:
             return "nothing that could be seen"
@@ -133,17 +135,17 @@ class LatentTorqueComparison:
 def compare_latent_torques(
     baseline: Stage, final: Stage | None, recordings: Sequence[Recording], progress: Progress | None = None
 ) -> LatentTorqueComparison:
-    """Latent torques under a baseline and under the final model.
+    """Latent torques with the baseline and with the final model.
 
     Args:
-        baseline: Before.
-        final: After; None where nothing was added.
-        recordings: Of each the first 30 s are used.
+        baseline: Stage of the baseline.
+        final: Stage of the final model; None if nothing was added.
+        recordings: Recordings, of which the first 30 s are used.
         progress: Called with a line of text now and then.
     """
     shown = [r.slice(0, min(r.N, round(SHOWN_SECONDS / r.Ts))) for r in recordings]
     if final is None or not all(e.slope_at_zero for e in final.model.mechanism.effects):
-        # Impacts of teeth have no slopes: a smoother would take an impact for a torque.
+        # An impact of teeth has no derivative: a smoother would mistake it for a torque.
         return LatentTorqueComparison(latent_torque(calibrated(baseline), shown, progress=progress), None)
     last = calibrated(final)
     first = with_effects_of(calibrated(baseline), last)
@@ -151,7 +153,7 @@ def compare_latent_torques(
 
 
 def calibrated(stage: Stage) -> Model:
-    """The model of a stage with the offsets that belong to its recordings."""
+    """The model of a stage, including the offsets that belong to its recordings."""
     m = stage.model.mechanism
     for e in stage.estimates:
         port, effect, parameter = e.name.rsplit(".", 2)
@@ -161,7 +163,7 @@ def calibrated(stage: Stage) -> Model:
 
 
 def with_effects_of(small: Model, large: Model) -> Model:
-    """A model as a larger one with effects switched off, so that both share compiled code."""
+    """A model with the effects of a larger model added and switched off, so that both share compiled code."""
     own = small.mechanism
     present = {(e.name, e.at) for e in own.effects}
     m = large.mechanism
@@ -173,34 +175,35 @@ def with_effects_of(small: Model, large: Model) -> Model:
     return Model(m.with_values(values), large.solver, gates)
 
 
-# A coefficient of less colours too little to matter.
+# Least coefficient of an AR(1) that counts as coloured noise.
 LEAST_COLOUR = 0.2
-# Chance of refusing an AR(1) where the errors are one, of each of the tests.
+# Probability with which each test rejects an AR(1) although the errors are one.
 FALSE_REFUSAL = 1e-3
-# Lags at which what an AR(1) leaves must be white.
+# Number of lags at which the residuals of an AR(1) must be white.
 LAGS = 25
-# Samples that any of these tests need.
+# Least number of samples for these tests.
 LEAST_SAMPLES = 400
 
 
 def coloured_noise(
     e: Float[np.ndarray, " N"], motion: Float[np.ndarray, "N M"], u: Float[np.ndarray, " N"], Ts: float
 ) -> float | None:
-    """The coefficient of an AR(1) that explains an error, where nothing of the motion remains in it.
+    """The coefficient of an AR(1) that explains an error, if the error is independent of the motion.
 
         e(t) = a e(t-1) + w(t)
 
-    `w` must be white (Ljung and Box), independent of the input, and neither its mean nor its size may follow
-    the motion: F tests of regressions of w and of |w| on positions, speeds, their signs and squares.
+    `w` must be white (test of Ljung and Box) and independent of the input. Neither its mean nor its size may
+    depend on the motion (F tests of regressions of w and of |w| on positions, speeds, their signs and
+    squares).
 
     Args:
-        e: Errors of free runs of one channel.
+        e: Errors of free runs in one channel.
         motion: Simulated signals and their derivatives.
         u: Input.
         Ts: Sampling period [s].
 
     Returns:
-        `a`, or None where the errors are something else, or nearly white.
+        The coefficient `a`; None if the errors are no AR(1), or nearly white.
 
     Source: G. M. Ljung and G. E. P. Box, Biometrika 65, 1978.
     """
@@ -238,18 +241,19 @@ def _depends(y: Float[np.ndarray, " N"], regressors: Float[np.ndarray, "N K"]) -
 
 
 def coloured_sensors(model: Model, recording: Recording, runs: Float[np.ndarray, "N C"]) -> dict[str, float]:
-    """Channel -> coefficient of an AR(1), for a model of whose errors nothing else remains.
+    """Channels of which the errors of free runs are coloured sensor noise, an AR(1).
 
     Args:
-        model: That was fitted.
-        recording: One that it was not fitted to.
-        runs: Its free run over that recording.
+        model: The fitted model.
+        recording: A recording to which it was not fitted.
+        runs: Its free run over this recording.
 
     Returns:
-        Empty where a channel has errors that are neither white nor an AR(1).
+        Channel -> coefficient of the AR(1). Empty if a channel has errors that are neither white nor an
+        AR(1).
     """
     y = np.asarray(model.measured(recording), float)
-    # That of the run, since what is measured has the noise in it.
+    # Motion of the free run, since the measured motion contains the noise.
     motion, first = np.column_stack([runs, np.gradient(runs, recording.Ts, axis=0)]), recording.n_init
     found = {}
     for channel, error in zip(model.mechanism.channels, (y - runs).T, strict=True):
@@ -263,14 +267,14 @@ def coloured_sensors(model: Model, recording: Recording, runs: Float[np.ndarray,
 
 
 def _is_white(e: Float[np.ndarray, " N"]) -> bool:
-    """Whether an error has little memory of itself."""
+    """Whether the autocorrelation of an error from one sample to the next is small."""
     x = e - e.mean()
     power = float(x @ x)
     return power > 0 and abs(float(x[1:] @ x[:-1])) / power < LEAST_COLOUR + 2 / math.sqrt(len(e))
 
 
 def advice(coloured: dict[str, float]) -> tuple[str, ...]:
-    """What to do where sensors have coloured noise, in a sentence; nothing for none."""
+    """Advice for sensors with coloured noise, in a sentence; nothing if there are none."""
     if not coloured:
         return ()
     listed = " and ".join(f"{c} ({a:.2g})" for c, a in coloured.items())
@@ -283,14 +287,15 @@ def advice(coloured: dict[str, float]) -> tuple[str, ...]:
 
 @dataclasses.dataclass(frozen=True)
 class Explanation:
-    """Everything that is computed for a report; writing it only formats and draws.
+    """Everything that is computed for a report; writing the report only formats and draws it.
 
     Attributes:
-        latent: Torques that the baseline and the final model lack; None where they were not computed.
-        learned: A torque learned for what is left; None where none was asked for or none can be learned.
-        remaining: Where the final model still fails; empty unless effects were found and something is left.
-        tests: Tests of the residuals, and frequency responses; None where they were not computed.
-        known: What sensors and recording determine of the final model; None where it was not computed.
+        latent: Torques that the baseline and the final model lack; None if they were not computed.
+        learned: A learned torque for what is left; None if none was requested or none can be learned.
+        remaining: Where the final model still fails; empty unless effects were found and something is
+            unexplained.
+        tests: Tests of the residuals, and frequency responses; None if they were not computed.
+        known: Identifiability of the model to use from sensors and recording; None if it was not computed.
     """
 
     latent: LatentTorqueComparison | None = None
@@ -301,7 +306,7 @@ class Explanation:
 
 
 def remaining_failures(found: SearchResult) -> tuple[Where, ...]:
-    """Where the final model fails on the longest held-out recording, if something is left unexplained."""
+    """Where the final model fails on the longest validation recording, if something remains unexplained."""
     if found.verdict != Verdict.UNEXPLAINED or not found.rounds:
         return ()
     i = found.longest_validation

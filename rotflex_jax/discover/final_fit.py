@@ -1,23 +1,21 @@
-"""The last fit of a search that ends unexplained: the chosen structure, to training and validation data.
+"""The final fit of a search that ends unexplained: the chosen structure, to training and validation data.
 
 A search fits its models to the training recordings alone, so that validation data can compare them. Once the
-structure is chosen, the validation recordings are as useful for a fit as the others: friction differs with
-the amplitude of the motion and from run to run, and half of the recordings show half of that.
+structure is chosen, the validation recordings are as useful for a fit as the training recordings: friction
+changes with the amplitude of the motion and from run to run, and more recordings show more of this.
 
-Parameters of an incomplete model depend on what they are fitted to. Those of the search are fitted to
-predictions, or to free runs that each have a fitted first state, which may hide a drift of the model. A user
-starts the model from a measured state. So this fit is to free runs over windows, each from the state that its
-first samples show. Where such a fit has clearly larger errors on validation data than the fit of the search,
-tried on the training recordings alone too, it is to free runs with fitted first states instead, as in the
-search. Validation data also decide whether recordings have offsets that the search could do without. A run of
-which nothing is known gets the offsets that the fitted runs have in common.
+Parameters of an incomplete model depend on what they are fitted to. The search fits them to predictions, or
+to free runs with fitted first states, which may hide a drift of the model. A user starts the model from a
+measured state. So the final fit is to free runs over windows that start from measured first states. If the
+errors of such a fit on validation data are clearly larger than the errors of the search, the first states are
+fitted instead, as in the search. Validation data also decide whether recordings get offsets that the search
+has left out. A run of which nothing is known gets the offsets that the fitted runs have in common.
 
-In a search each free run has a fitted first state, which hides much of the difference between one law of
-friction and another. Runs from measured first states show this difference: a law that the search cannot
-exclude, or that contains the one found, takes its place where these runs are better with it beyond doubt.
-Where every run is better beyond doubt with a friction of its own size, each has one. An offset that a single
-run has shown is left out where that run is hardly better with it. So is any effect but the first where such
-runs are not clearly better with it: in predictions it may make up, within a few samples, for what no
+Fitted first states hide much of the difference between two laws of friction; measured first states show it.
+A law that the search cannot exclude, or that contains the law found, replaces it if free runs from measured
+first states are clearly better with it. Each run gets friction of its own size if every run is clearly better
+with it. The offsets of a single run are left out if free runs are not clearly better with them. The same
+holds for every effect but the first: in predictions it may compensate, within a few samples, for what no
 candidate explains.
 """
 
@@ -55,10 +53,11 @@ from rotflex_jax.fit.result import Fit
 from rotflex_jax.recording import Recording
 from rotflex_jax.recording.recording import joined
 
-# Errors of a fit from measured first states over those of the search, both fitted to training recordings,
-# up to which the former is taken: logarithm of their ratio on validation data, mean over channels.
+# A fit from measured first states is refused if its errors on validation data exceed the errors of the
+# search, both fitted to training recordings, by more than this: logarithm of the ratio, mean over channels.
 MOST_WORSE = 0.2
-# Where runs validate each other, at most so many fits, each without a share of them, rate a way of fitting.
+# Where runs validate each other, the largest number of fits by which a structure is rated, each of them
+# without a share of the runs.
 MOST_FOLDS = 3
 
 
@@ -66,7 +65,7 @@ class Refused(NamedTuple):
     """Why the final model was not fitted to training and validation recordings together.
 
     Attributes:
-        sentence: For the notes of a result.
+        sentence: The reason, for the notes of a result.
     """
 
     sentence: str
@@ -78,33 +77,33 @@ def fit_to_all(
     """The final model fitted once more, to training and validation recordings together.
 
     Args:
-        state: What was found.
+        state: The search with what it has found.
         stage: The final model as it is reported.
-        final: The same as a hypothesis.
-        evaluation: The recordings that errors are reported on.
+        final: The final model as a hypothesis.
+        evaluation: The recordings on which errors are reported.
 
     Returns:
-        The fit; or why there is none: its errors on validation data are clearly larger than those of the
-        search, fitted without these data or to them as well, or it has a periodic disturbance, whose phase
-        no other recording shares.
+        The fit, or the reason why there is none. One reason is that its errors on validation data are clearly
+        larger than the errors of the search, with or without these data in the fit. Another reason is a
+        periodic disturbance, whose phase no other recording shares.
     """
     if state.problem.supermodel.phased.intersection(final.hypothesis.local):
         return _refused(state, "it has a periodic disturbance, whose phase no other recording shares")
     state.say("fitting the chosen structure to all training and validation recordings")
     try:
         return _LastFit(state, stage, evaluation).made(final.hypothesis)
-    except InputError as error:  # some recordings cannot be fitted alone: no reason to lose what was found
+    except InputError as error:  # some recordings cannot be fitted alone; the result of the search remains
         return _refused(state, str(error).rstrip("."))
 
 
 def _refused(state: SearchState, why: str) -> Refused:
-    """A reason as a sentence."""
+    """A refusal with its reason as a sentence."""
     used = "all recordings" if state.validation.folds else "training and validation recordings together"
     return Refused(f"The model to use is that of the search, not one fitted to {used}: {why}.")
 
 
 def _worse(ratio: float, seconds: float) -> str:
-    """That errors are larger, by the logarithm of their ratio."""
+    """A clause that errors are larger, given the logarithm of their ratio."""
     if np.isinf(ratio):
         return "its runs of the validation data diverge"
     return f"its errors over {seconds:g} s on validation data are {np.exp(ratio):.3g} times as large"
@@ -114,8 +113,8 @@ class _Tried(NamedTuple):
     """A structure fitted without the validation data.
 
     Attributes:
-        fits: To the training recordings; where runs validate each other, one without each of them.
-        errors: On the validation recordings, with their own offsets if these count.
+        fits: The fit to the training recordings; where runs validate each other, one fit without each run.
+        errors: Errors on the validation recordings, with the own offsets of each where these are calibrated.
     """
 
     fits: Sequence[FittedStructure]
@@ -123,7 +122,7 @@ class _Tried(NamedTuple):
 
     @property
     def structure(self) -> FinalStructure:
-        """What is fitted."""
+        """The structure that is fitted."""
         return self.fits[0].structure
 
 
@@ -131,10 +130,12 @@ class _Candidate(NamedTuple):
     """A structure fitted to all recordings.
 
     Attributes:
-        tried: The structure fitted without the validation data, whose errors on these may refuse it.
-        fitted: It is fitted to all; its friction may belong to runs, unlike in `tried`.
-        laws: Pairs of an effect that was found and the law that stands in its place.
-        left_out: Effects and offsets that were found and that the structure does without.
+        tried: The structure fitted without the validation data. It is refused if its errors on them are too
+            large.
+        fitted: The structure fitted to all recordings. Its friction may have a size for each run, unlike in
+            `tried`.
+        laws: Pairs of an effect that was found and the law that replaces it.
+        left_out: Effects and offsets that were found and that the structure does not have.
     """
 
     tried: _Tried
@@ -148,9 +149,9 @@ class _LastFit:
     """The final fit of one search.
 
     Attributes:
-        state: What was found.
+        state: The search with what it has found.
         stage: The final model as it is reported.
-        evaluation: The recordings that errors are reported on.
+        evaluation: The recordings on which errors are reported.
     """
 
     state: SearchState
@@ -159,28 +160,28 @@ class _LastFit:
 
     @functools.cached_property
     def recordings(self) -> tuple[Recording, ...]:
-        """Training and validation recordings, parts of one run that follow on each other as one."""
+        """Training and validation recordings, with adjoining parts of one run as one recording."""
         validation = self.state.validation
         held_back = () if validation.folds else validation.problem.dataset.recordings
         return joined((*self.state.problem.dataset.recordings, *held_back))
 
     @property
     def runs(self) -> KnownRuns:
-        """Those of the recordings."""
+        """The runs of the fitted recordings."""
         return self.evaluation.runs._replace(recordings=self.recordings)
 
     @property
     def carried_over(self) -> RunErrors:
-        """Errors of the search's own fit on the validation recordings, with nothing of these."""
+        """Errors of the search's own fit on the validation recordings, without their own offsets."""
         return RunErrors(self.stage.held_out_rmse, self.stage.held_out_rmse_windows)
 
     @property
     def searched(self) -> RunErrors:
-        """The same with their own offsets, if these count."""
+        """Errors of the search's own fit, with the offsets of each recording where they are calibrated."""
         return self.stage.calibrated or self.carried_over
 
     def made(self, h: Hypothesis) -> FinalFit | Refused:
-        """The fit of a final model; or why that from measured first states is refused, where all are."""
+        """The final fit of a model; if all are refused, why the fit from measured first states was."""
         state, seconds, s = self.state, self.state.validation.window_seconds, self.state.problem.supermodel
         variants = {v.locations: v for v in (h, with_all_calibrations(s, h))}
         structures = [
@@ -206,7 +207,7 @@ class _LastFit:
     def with_fitted_first_states(
         self, structures: Sequence[FinalStructure]
     ) -> tuple[FinalFit, FittedStructure] | None:
-        """The fit to free runs like those of the search; None where it is refused too."""
+        """The fit to free runs with fitted first states, as in the search; None where it is refused too."""
         self.state.say("  with fitted first states")
         best = self.best_trial([each.as_searched() for each in structures])
         if log_error_ratio(best.errors, self.searched) > MOST_WORSE:
@@ -215,13 +216,13 @@ class _LastFit:
         return None if isinstance(made, Refused) else made
 
     def best_trial(self, structures: Sequence[FinalStructure]) -> _Tried:
-        """The structure that has the smallest errors on validation data."""
+        """The structure with the smallest errors on validation data."""
         return min(self.tried(structures), key=lambda each: log_error_ratio(each.errors, self.searched))
 
     def fitted_to_all(self, tried: _Tried) -> FittedStructure:
-        """The fit to all recordings of what was fitted without the validation data.
+        """The fit to all recordings of a structure that was fitted without the validation data.
 
-        It starts from there too, as laws in question do: neither has a start that the other lacks.
+        This earlier fit is one of its starts. Other laws have such a start too, so no law has an advantage.
         """
         structure = tried.structure.also_from(tried.fits[0].fit.model)
         (fitted,) = fit_structures([(structure, self.recordings)])
@@ -242,9 +243,10 @@ class _LastFit:
         return tried
 
     def without_needless_offsets(self, candidate: _Candidate) -> _Candidate:
-        """The same without offsets that a single run has shown, if it is not clearly better with them.
+        """The candidate without the offsets of a single run, if free runs are not clearly better with them.
 
-        Other parameters make up for an offset that is not fitted, but not for one that is left out later.
+        They are left out of the fit, since other parameters then compensate for them. They would not
+        compensate for an offset that is fitted and then removed.
         """
         offsets = [p for p in candidate.tried.structure.on if p in self.state.problem.supermodel.calibrations]
         if self.evaluation.runs.compared or not offsets:
@@ -252,10 +254,10 @@ class _LastFit:
         return self.without(candidate, offsets)
 
     def without_needless_effects(self, candidate: _Candidate) -> _Candidate:
-        """The same without effects that free runs of all recordings are not clearly better with.
+        """The candidate without effects that do not make free runs over all recordings clearly better.
 
-        The last one found is tried first, and the first one stays. Runs of validation data must not be
-        clearly better with the effect either.
+        The effect found last is tested first, and the first effect always stays. Free runs over validation
+        data must not be clearly better with the effect either.
         """
         calibrations = self.state.problem.supermodel.calibrations
         effects = [p for p in candidate.tried.structure.on if p not in calibrations]
@@ -266,16 +268,17 @@ class _LastFit:
     def without(
         self, candidate: _Candidate, locations: Sequence[EffectLocation], most_worse: float = np.inf
     ) -> _Candidate:
-        """The candidate fitted without some of what was found, unless data need it.
+        """The candidate fitted without some effects or offsets, unless the data need them.
 
         Args:
-            candidate: With all of it.
-            locations: What is left out.
-            most_worse: Logarithm of the ratio by which errors on validation data may be larger without it.
+            candidate: The candidate with all of them.
+            locations: Effects or offsets that are left out.
+            most_worse: Logarithm of the ratio by which errors on validation data may be larger without them.
 
         Returns:
-            The candidate itself where free runs of all recordings are clearly better than without, where
-            errors on validation data grow by more than that, and where the fit without is refused.
+            The new candidate; or the candidate itself if free runs over all recordings are clearly better
+            with what is left out, if errors on validation data grow by more than `most_worse`, or if the new
+            fit is refused.
         """
         self.state.say(f"  without {', '.join(map(str, locations))}")
         (tried,) = self.tried([candidate.tried.fits[0].without(locations)])
@@ -294,9 +297,9 @@ class _LastFit:
         return candidate if isinstance(self.accepted(fewer), Refused) else fewer
 
     def with_better_laws(self, candidate: _Candidate) -> _Candidate:
-        """The same with other laws in the places of those found, where free runs are better with them."""
+        """The candidate with other laws in the places of those found, where free runs are better so."""
         for location in self.state.order:
-            if location in candidate.tried.structure.on:  # not where a law has taken its place already
+            if location in candidate.tried.structure.on:  # not if a law has replaced it already
                 candidate = self.with_best_law(candidate, location)
         return candidate
 
@@ -315,7 +318,7 @@ class _LastFit:
         ]
         for other, law in sorted(better, key=lambda each: each[0].fit.cost):
             (tried,) = self.tried([other.structure])
-            # With the law, errors on validation data may grow by no more than the fit itself is allowed.
+            # With the law, errors on validation data may grow by no more than the limit for the fit itself.
             before = (self.searched, candidate.tried.errors)
             if all(log_error_ratio(tried.errors, errors) <= MOST_WORSE for errors in before):
                 replaced = [(p, law) for p in structure.on if p not in other.structure.on]
@@ -323,9 +326,9 @@ class _LastFit:
         return candidate
 
     def with_own_friction(self, candidate: _Candidate) -> _Candidate:
-        """The same with dry friction of its own size in each run, if every run is better with that."""
+        """The candidate with dry friction of its own size in each run, if every run is clearly better so."""
         if log_error_ratio(candidate.tried.errors, self.searched) > MOST_WORSE:
-            return candidate  # it would be refused for that
+            return candidate  # it would be refused for its errors
         structure = candidate.fitted.with_own_friction()
         if not (structure.friction and self.evaluation.runs.compared and len(self.recordings) > 1):
             return candidate
@@ -336,15 +339,19 @@ class _LastFit:
         return candidate._replace(fitted=fitted)
 
     def runs_prefer(self, a: Fit, b: Fit, every: bool = False) -> bool:
-        """Whether errors of free runs of fit `a` are a tenth smaller than those of `b`, beyond doubt.
+        """Whether free runs are clearly better with fit `a` than with fit `b`.
+
+        Errors must be smaller by a tenth, and the log-likelihood larger by more than 2.5 standard deviations
+        of its scatter over half seconds.
 
         Args:
             a: The fit in question.
-            b: The fit that it is compared with.
-            every: Whether the runs of every recording have to be better with it beyond doubt.
+            b: The fit with which it is compared.
+            every: Whether the log-likelihood of every recording must be larger by this much, and not only of
+                all recordings together.
         """
         smaller = mean_log_ratio(*(np.array([x.noise[c] for c in b.noise]) for x in (a, b)))
-        if np.isinf(smaller):  # one of them diverges, and its half seconds are not numbers
+        if np.isinf(smaller):  # one of them diverges, and its blocks are not finite
             return smaller < 0
         gains = list(zip(self.blocks(a), self.blocks(b), strict=True))
         if not every:
@@ -354,9 +361,9 @@ class _LastFit:
     def blocks(self, found: Fit) -> list[Float[np.ndarray, " B"]]:
         """Log-likelihood of free runs in each half second of each recording, up to a constant [nat].
 
-        It is the one that the fit maximises. Unlike in a search, where an effect has to help everywhere,
-        large errors count by their square: they are what a user of the model sees. If a few half seconds
-        decide, their scatter is as large.
+        The fit maximises this likelihood. In a search an effect must help everywhere, so errors count by
+        their logarithm; here large errors count by their square, since a user of the model sees them. If a
+        few half seconds dominate the gain, its scatter is large as well.
         """
         out, noise = [], np.array(list(found.noise.values()))
         for k, r in enumerate(self.recordings):
@@ -367,23 +374,24 @@ class _LastFit:
         return out
 
     def hypotheses(self, fitted: FittedStructure, recordings: Sequence[Recording]) -> list[Hypothesis]:
-        """A fit to all, for some recordings: one for each where friction belongs to runs."""
+        """A fit to all recordings as hypotheses: one for each recording if friction differs between runs."""
         return fitted.as_hypotheses([self.runs.index(r) for r in recordings])
 
     def accepted(self, candidate: _Candidate) -> tuple[FinalFit, FittedStructure] | Refused:
-        """The result with a candidate and its fit, or why it is refused for its errors on validation data.
+        """The result for a candidate, with its fit; or why it is refused for its errors on validation data.
 
-        Neither the same fit without these data nor this fit may be clearly worse than that of the search.
+        Neither this fit nor the same fit without the validation data may be clearly worse on them than the
+        search's own fit.
         """
         tried, fitted, laws, left_out = candidate
         trained, seconds = tried.errors, self.state.validation.window_seconds
         if (ratio := log_error_ratio(trained, self.searched)) > MOST_WORSE:
             others = "the other recordings" if self.state.validation.folds else "the training recordings"
             return _refused(self.state, f"fitted in that way to {others} alone, {_worse(ratio, seconds)}")
-        # A fit to recordings that does clearly worse on them than one without them has failed.
-        # Without their offsets it may be worse by more.
+        # If a fit to the validation data is clearly worse on them than a fit without them, it has failed. The
+        # limit is larger where errors are computed without the own offsets of the recordings.
         if self.evaluation.runs.compared and len(self.recordings) > 1:
-            # What most runs have in common may be far from what a run of validation data has.
+            # The common offsets of the runs may differ much from the offsets of a validation run.
             options = [fitted.with_common_offsets(), fitted]
         else:
             options = [FittedStructure(_with_offsets_that_help(tried, self.evaluation), fitted.fit)]
@@ -411,13 +419,13 @@ class _LastFit:
         return made, fitted
 
     def tested(self, made: FinalFit, fitted: FittedStructure) -> FinalFit:
-        """A final fit with its errors on test recordings, if there are any."""
+        """The final fit with its errors on test recordings, if there are any."""
         test, seconds = self.evaluation.test, self.evaluation.calibrate_seconds
         if not test:
             return made
         structure, own = fitted.structure, fitted.own_values(len(self.recordings))
         each = self.hypotheses(fitted, test.problem.dataset.recordings)
-        # Of one run alone, validation data have decided already whether its own offsets are of use.
+        # For a single run, validation data have already decided whether to carry over its offsets.
         of_runs = structure.own if self.runs.compared else ()
         errors = errors_on_test(test, each, own, structure.on, self.runs, of_runs)
         calibrated = errors_with_own_calibration(test, each, structure.on, seconds) if seconds else None
@@ -425,7 +433,7 @@ class _LastFit:
 
 
 def _with_offsets_that_help(tried: _Tried, evaluation: Evaluation) -> FinalStructure:
-    """The structure that carries over the offsets with which runs of validation data are better."""
+    """The structure that carries over those offsets with which runs over validation data are better."""
     each, structure = [fitted.as_hypothesis() for fitted in tried.fits], tried.structure
     for location in structure.own:
         more = structure.carrying(location)
@@ -436,13 +444,13 @@ def _with_offsets_that_help(tried: _Tried, evaluation: Evaluation) -> FinalStruc
 
 
 def log_error_ratio(a: RunErrors, b: RunErrors) -> float:
-    """Logarithm of errors `a` over windows by errors `b`, mean over channels; see `mean_log_ratio`."""
+    """Mean over channels of the logarithm of errors `a` over errors `b`, both of free runs over windows."""
     before, after = (np.array([x.windows[c] for c in b.windows]) for x in (b, a))
     return mean_log_ratio(after, before)
 
 
 def _without_each(train: Sequence[Recording]) -> list[list[Recording]]:
-    """Training recordings without each in turn; of many, without every third one at a time."""
+    """Training recordings without each one in turn; if there are more than three, without a third of them."""
     folds, each = min(len(train), MOST_FOLDS), range(len(train))
     return [[train[k] for k in each if k % folds != fold] for fold in range(folds)]
 
@@ -450,7 +458,13 @@ def _without_each(train: Sequence[Recording]) -> list[list[Recording]]:
 def _on_validation(
     structure: FinalStructure, trained: Sequence[Hypothesis], evaluation: Evaluation
 ) -> RunErrors:
-    """Errors on validation recordings of one hypothesis or one for each, with own offsets if these count."""
+    """Errors on validation recordings, with the own offsets of each recording where they are calibrated.
+
+    Args:
+        structure: Gives the effects that are on.
+        trained: One hypothesis for all recordings, or one for each.
+        evaluation: The recordings.
+    """
     validation, seconds = evaluation.validation, evaluation.calibrate_seconds
     if not seconds:
         return errors_as_trained(validation, trained, structure.on)

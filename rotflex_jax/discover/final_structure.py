@@ -1,7 +1,6 @@
-"""What the final fit fits: effects, the parameters that each recording has for itself, where fits start.
+"""Structures that the final fit tries: effects, local parameters, and starts of the fits.
 
-The fits are to free runs over windows. They start from what their first samples show, or from first states
-that are fitted too.
+They are fitted to free runs over windows, which start from measured first states or from fitted ones.
 """
 
 import dataclasses
@@ -26,19 +25,20 @@ from rotflex_jax.runtime.xla import mesh_of, on_threads
 
 @dataclasses.dataclass(frozen=True)
 class FinalStructure:
-    """What is fitted.
+    """A structure that is fitted to free runs.
 
     Attributes:
-        starts: Models from which fits start, with the calibrations of the recordings; the first one has the
-            parameters of the search, or of an earlier fit, and the last one usual ones, if there are several.
-        local: Parameters that each recording has for itself.
+        starts: Models from which fits start, with the calibrations of the recordings. The first one has the
+            parameters of the search or of an earlier fit. If there are several, the last one has usual
+            values.
+        local: Names of parameters that have a value for each recording.
         own: Calibrations that are not carried over to other recordings.
-        on: What is on in the model that a user gets.
-        hypothesis: The same as the search has it.
-        supermodel: What it is a hypothesis of.
+        on: Effects and calibrations that are on in the model that a user gets.
+        hypothesis: The structure as a hypothesis of the search.
+        supermodel: The super-model of this hypothesis.
         window_seconds: Length of free runs [s].
-        friction: Sizes of friction among `local`.
-        first: Whether free runs start from what their first samples show, or from fitted first states.
+        friction: Names of the sizes of friction among `local`.
+        first: Whether free runs start from measured or from fitted first states.
     """
 
     starts: tuple[Model, ...]
@@ -66,12 +66,12 @@ class FinalStructure:
         Fits start from its parameters and from usual ones.
 
         Args:
-            s: What it is a hypothesis of.
+            s: The super-model.
             solver: Integration rule.
             h: The hypothesis.
-            on: What is on in the model that a user gets.
+            on: Effects and calibrations that are on in the model that a user gets.
             window_seconds: Length of free runs [s].
-            usual_shapes: Whether fits start besides from its amplitudes with usual shapes.
+            usual_shapes: Whether one more fit starts from the amplitudes of the hypothesis with usual shapes.
         """
         given = [h.mean_values(s), _values_as_given(s, h)]
         if usual_shapes:
@@ -90,15 +90,15 @@ class FinalStructure:
         return self.starts[0].solver
 
     def also_from(self, start: Model) -> "FinalStructure":
-        """The same with a further start."""
+        """The same structure with a further start."""
         return dataclasses.replace(self, starts=(*self.starts, start))
 
     def as_searched(self) -> "FinalStructure":
-        """The same with fitted first states, from the parameters of the search without usual ones."""
+        """The same structure with fitted first states; fits start only from the parameters of the search."""
         return dataclasses.replace(self, starts=self.starts[:1], first="fitted")
 
     def carrying(self, *locations: EffectLocation) -> "FinalStructure":
-        """The same where the model that a user gets has these calibrations of the recordings."""
+        """The same structure with these calibrations carried over to the model that a user gets."""
         own = tuple(p for p in self.own if p not in locations)
         return dataclasses.replace(self, own=own, on=(*self.on, *locations))
 
@@ -111,13 +111,13 @@ class FittedStructure:
     fit: Fit
 
     def with_law(self, law: EffectLocation) -> FinalStructure:
-        """The structure with a law in the place of all others of the same thing at its port.
+        """The structure with a law that replaces all other laws of the same thing at its port.
 
-        The first start has the values of the fit, and the law keeps those of parameters of the same name; the
-        second start is that of a user.
+        The first start has the values of the fit; the new law takes over parameters of the same name. The
+        second start has the user's values, and usual values of the effects that were found.
 
         Args:
-            law: It takes their place; a candidate at the port.
+            law: The new law, a candidate at the port.
         """
         this, s = self.structure, self.structure.supermodel
         replaced = [p for p in this.on if p in s.other_laws(law)]
@@ -134,7 +134,7 @@ class FittedStructure:
         return FinalStructure.of(this.supermodel, this.solver, h, on, this.window_seconds, usual_shapes=False)
 
     def with_own_friction(self) -> FinalStructure:
-        """The structure with dry friction of its own size in each recording; it starts from this fit."""
+        """The structure with sizes of dry friction for each recording; starts: this fit, usual values."""
         m, sizes, this = self.fit.model.mechanism, list[str](), self.structure
         units = {n: spec.unit for n, spec in zip(m.parameter_names, m.parameter_specifications, strict=True)}
         for effect in [e for e in m.effects if e.law_of == DRY_FRICTION]:
@@ -144,10 +144,10 @@ class FittedStructure:
         return dataclasses.replace(this, starts=starts, local=(*this.local, *sizes), friction=tuple(sizes))
 
     def as_hypothesis(self, run: int | None = None) -> Hypothesis:
-        """The fit in the terms of the search, what recordings have for themselves at its mean.
+        """The fit as a hypothesis of the search, with the mean of local parameters.
 
         Args:
-            run: Which of the fitted recordings the friction is of, where each has its own; None for the mean.
+            run: Index of the fitted recording whose friction is used, if each has its own; None for the mean.
         """
         s, h, m = self.structure.supermodel, self.structure.hypothesis, self.fit.model.mechanism
         if run is not None:
@@ -158,17 +158,18 @@ class FittedStructure:
         return dataclasses.replace(h, z=z, local_z=np.tile(z[list(h.local)], (len(h.x0), 1)))
 
     def as_hypotheses(self, runs: Sequence[int | None]) -> list[Hypothesis]:
-        """The same for some recordings: one for each where friction belongs to runs, else one for all.
+        """The fit as hypotheses for some recordings: one for each if friction differs between runs, else one.
 
         Args:
-            runs: Which of the fitted recordings each is a run of; None where it is of none.
+            runs: For each recording, the index of the fitted recording of the same run; None if there is
+                none.
         """
         if not self.structure.friction:
             return [self.as_hypothesis()]
         return [self.as_hypothesis(run) for run in runs]
 
     def own_values(self, count: int) -> Float[np.ndarray, "K L"]:
-        """Unconstrained values of the local parameters of the search in each of the fitted recordings."""
+        """Unconstrained values of the local parameters of the search in each fitted recording."""
         s, m = self.structure.supermodel, self.fit.model.mechanism
         transform = Transform.of(m.parameter_specifications)
         z = np.array([transform.unconstrain(self.fit.model_of(k).mechanism.values) for k in range(count)])
@@ -176,17 +177,18 @@ class FittedStructure:
         return z[:, [m.parameter_names.index(n) for n in names]]
 
     def with_common_offsets(self) -> "FittedStructure":
-        """The same, carrying over what runs have in common of their offsets.
+        """The fit with the common part of the offsets of the runs carried over to other recordings.
 
-        The offset of a run is that of the machine plus a deviation of the run. By the values of K runs, with
-        mean m and variance s^2 (of K - 1 degrees of freedom), that of the machine is estimated as
+        The offset of a run is the offset of the machine plus a deviation of the run. From the values of K
+        runs, with mean m and variance s^2 (K - 1 degrees of freedom), the offset of the machine is estimated
+        as
 
             m max(0, 1 - s^2 / (K m^2)):
 
-        their mean where they agree, zero where it is no larger than its standard deviation.
+        the mean where the runs agree, and zero where the mean is no larger than its standard deviation.
 
-        This is an empirical Bayes estimate with a prior of mean zero; it is better than the mean where what
-        runs have in common is small against their scatter.
+        This is an empirical Bayes estimate with a prior of mean zero. It is better than the mean if the
+        common part is small compared with the scatter of the runs.
 
         Source: after B. Efron and C. Morris, "Stein's estimation rule and its competitors - an empirical
         Bayes approach", Journal of the American Statistical Association 68 (1973) 117-130.
@@ -206,7 +208,7 @@ class FittedStructure:
 
     @property
     def model(self) -> Model:
-        """The model of the fit without what belongs to the recordings that were fitted."""
+        """The model of the fit without calibrations that belong to the fitted recordings."""
         m = self.fit.model.mechanism
         for location in self.structure.own:
             m = m.without(*location)
@@ -216,24 +218,28 @@ class FittedStructure:
 def fit_structures(
     asked: Sequence[tuple[FinalStructure, Sequence[Recording]]],
 ) -> list[FittedStructure]:
-    """Structures fitted to free runs of recordings, each the likeliest of the ends from its starts.
+    """Structures fitted to free runs over recordings; for each, the likeliest of the fits from its starts.
 
-    An end whose parameters the recordings do not reach is taken only if there is no other. Parameters of
-    predictions may lead to another local minimum of free runs than usual ones: to stiff, damped bristles of
-    a friction instead of soft ones. Those of the search's free runs may, too.
+    A fit with parameters that the recordings do not reach is taken only if there is no other. Different
+    starts may end in different local minima. From parameters fitted to predictions, a friction may get stiff,
+    damped bristles; from usual parameters, soft ones. The same may happen from the search's fit to free runs.
+
+    Args:
+        asked: Structures, each with the recordings to which it is fitted.
     """
 
     def end(job: tuple[int, Model]) -> Fit:
         k, start = job
         structure, recordings = asked[k]
-        # Starts that the search has found take the place of restarts.
+        # These starts replace the restarts of a fit.
         how = {"first": structure.first, "window_seconds": structure.window_seconds, "restarts": 0}
         return fit(start, list(recordings), local=structure.local, **how)
 
-    # Those of one structure share a program, which one of them compiles: others first.
+    # Fits of one structure share a program, which the first of them compiles, so fits of other structures
+    # come between them.
     most = max((len(structure.starts) for structure, _ in asked), default=0)
     jobs = [(k, x.starts[i]) for i in range(most) for k, (x, _) in enumerate(asked) if i < len(x.starts)]
-    # A fit spreads over several devices, if there are some.
+    # If there are several devices, each fit uses all of them.
     fits = on_threads(end, jobs) if mesh_of() is None else [end(job) for job in jobs]
     ends: list[list[Fit]] = [[] for _ in asked]
     for (k, _), found in zip(jobs, fits, strict=True):
@@ -248,9 +254,9 @@ def fit_structures(
 
 
 def _common(of_runs: Sequence[Estimate]) -> Estimate:
-    """What runs have in common by the estimates of each; see `FittedStructure.with_common_offsets`.
+    """The common part of the estimates of several runs; see `FittedStructure.with_common_offsets`.
 
-    Its interval has the width of that of their mean, by how they differ.
+    Its interval has the width of the interval of the mean, which follows from the scatter of the runs.
     """
     values = [e.value for e in of_runs]
     count, mean = len(values), float(np.mean(values))
@@ -262,9 +268,10 @@ def _common(of_runs: Sequence[Estimate]) -> Estimate:
 
 
 def _values_with_usual_shapes(s: SuperModel, h: Hypothesis) -> Float[np.ndarray, " P"]:
-    """Parameter values with amplitudes in the unit of an effect's first parameter as fitted, others as usual.
+    """Parameter values with fitted sizes and usual shapes of the effects that were found.
 
-    An effect without such an amplitude is left as it is.
+    The sizes of an effect are its amplitudes that have the unit of its first parameter. An effect without
+    such an amplitude keeps all of its fitted values.
     """
     values, specs = h.mean_values(s), s.mechanism.parameter_specifications
     for location in s.without_calibrations(h.locations):
@@ -277,7 +284,7 @@ def _values_with_usual_shapes(s: SuperModel, h: Hypothesis) -> Float[np.ndarray,
 
 
 def _values_as_given(s: SuperModel, h: Hypothesis) -> Float[np.ndarray, " P"]:
-    """Values of the user's model as given and usual ones of what was found; calibrations as fitted."""
+    """Parameter values: the user's values, usual values of the effects found, and fitted calibrations."""
     values, given = h.mean_values(s), list(s.baseline_free)
     values[given] = s.mechanism.values[given]
     for location in s.without_calibrations(h.locations):

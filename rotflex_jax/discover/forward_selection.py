@@ -1,4 +1,4 @@
-"""One round of forward selection: candidates scored, the best refitted, and one effect or a pair added."""
+"""One round of forward selection: score candidates, refit the best, and add one effect or a pair."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -23,9 +23,10 @@ from rotflex_jax.discover.validation import ValidatedHypothesis
 from rotflex_jax.effects.base import DRY_FRICTION
 from rotflex_jax.effects.labels import law_of
 
-# Candidates of both rankings together that are refitted in a round, the best of each beside them, and rounds.
+# Number of candidates that are refitted in a round, to which the best one of each horizon is added, and
+# largest number of rounds.
 REFITTED, ROUNDS = 4, 4
-# Laws of dry friction that are refitted where the first round has tried none and adds nothing.
+# Number of laws of dry friction that are refitted if the first round has tried none and adds nothing.
 FRICTION_LAWS = 2
 
 
@@ -33,10 +34,10 @@ class Promising(NamedTuple):
     """Candidates that are worth a refit.
 
     Attributes:
-        beside: The model that they are added to.
-        scores: Of predictions; effects that contain one that is on have none.
-        starts: Where refits of predictions start.
-        runs_starts: Where those of free runs start.
+        beside: The model to which they are added.
+        scores: Scores in predictions; candidates that contain an effect with memory that is on have none.
+        starts: Starts of refits to predictions.
+        runs_starts: Starts of refits to free runs.
     """
 
     beside: ValidatedHypothesis
@@ -48,14 +49,14 @@ class Promising(NamedTuple):
     def at(
         cls, beside: ValidatedHypothesis, scores: Sequence[list[Score]], places: Sequence[EffectLocation]
     ) -> "Promising":
-        """Those at some places, from the scores of predictions and of free runs beside a model."""
+        """Candidates at given locations, with starts from the scores for a model at both horizons."""
         first, second = ({x.location: x for x in listed} for listed in scores)
         found = [first[p] for p in places]
         return cls(beside, found, [x.start for x in found], [second[p].start for p in places])
 
 
 def score_candidates(state: SearchState) -> list[Promising]:
-    """The candidates with the best scores beside each model that they may be added to."""
+    """The candidates with the best scores for each model to which they may be added."""
     left = len(state.problem.supermodel.candidates) - len(state.scores)
     state.say(beginning("score", f"round {len(state.scores) + 1}: scoring {left} candidates"))
     found = [_promising(state, state.origin)]
@@ -66,7 +67,7 @@ def score_candidates(state: SearchState) -> list[Promising]:
 
 
 def _promising(state: SearchState, beside: ValidatedHypothesis) -> Promising:
-    """The candidates with the best scores at both horizons, and effects that contain one that is on."""
+    """The candidates with the best scores at both horizons, and `generalisations` of effects that are on."""
     listed, runs = state.rank(beside)
     chosen = promising_at_both(listed, runs, REFITTED)
     known = {x.location for x, _ in chosen}
@@ -81,15 +82,16 @@ def _promising(state: SearchState, beside: ValidatedHypothesis) -> Promising:
 
 
 def add_dry_friction(state: SearchState, promising: Sequence[Promising]) -> bool:
-    """Add dry friction at a motor where the first round has tried none and adds nothing; False if no better.
+    """Add dry friction at a motor if the first round has tried none and adds nothing; False if none passes.
 
-    Every machine has some, but its slopes say little of it beside a model whose inertia or damping stands in
-    its place, or where another effect that is missing explains far more. An effect that was found may itself
-    stand for the friction (a dead zone of the input, say), and a second law of it would only follow errors.
+    Every machine has dry friction. But its slopes say little about it if the inertia or the damping of the
+    model compensates for it, or if another missing effect explains far more. After an effect was found, no
+    friction is added in this way: the effect may itself represent the friction (for example a dead zone of
+    the input), and friction in addition would only follow errors.
 
     Args:
-        state: What was found so far.
-        promising: What the round has tried.
+        state: The search with what it has found so far.
+        promising: Candidates that the round has tried.
     """
     s, tried = state.problem.supermodel, [start.location.effect for p in promising for start in p.starts]
     known = (*tried, *(e.name for e in s.baseline.effects))
@@ -115,19 +117,19 @@ def refit_and_validate(
     starts: list[CandidateStart],
     runs_starts: list[CandidateStart],
 ) -> list[ValidatedHypothesis]:
-    """A model with each candidate, refitted and validated; what is not plausible is left out.
+    """A model with each candidate, refitted and validated at both horizons; implausible fits are left out.
 
     Args:
-        state: Where they join what was tried.
-        beside: The model that they are added to.
-        starts: Where refits of predictions start.
-        runs_starts: Where those of free runs start.
+        state: The search; the models join `state.tried`.
+        beside: The model to which candidates are added.
+        starts: Starts of refits to predictions.
+        runs_starts: Starts of refits to free runs.
     """
     s, horizons = state.problem.supermodel, state.horizons
     assert beside.free_run
     grown = refit_candidates(state.problem, beside.hypothesis, starts)
     state.say("  predictions are fitted, free runs follow")
-    # A shape that predictions have found is worth a start of free runs.
+    # The values fitted to predictions are one more start of the refits to free runs.
     informed = [
         dataclasses.replace(y, others=(*y.others, h.mean_values(s)[s.parameter_indices(y.location)]))
         for y, h in zip(runs_starts, grown, strict=True)
@@ -152,7 +154,7 @@ def refit_and_validate(
 
 
 def add_best(state: SearchState, promising: Sequence[Promising]) -> bool:
-    """Refit what is promising and add what validation data prefer; False where they prefer none of it."""
+    """Refit promising candidates and add the one that validation data prefer; False if none passes."""
     scored, refitted = [], []
     for beside, scores, starts, runs_starts in promising:
         state.say(beginning("refit", "refitting " + ", ".join(str(start.location) for start in starts)))
@@ -180,7 +182,7 @@ def add_best(state: SearchState, promising: Sequence[Promising]) -> bool:
 def _refit_replaced(
     state: SearchState, winner: ValidatedHypothesis, tried: Sequence[EffectLocation]
 ) -> list[tuple[Score, ValidatedHypothesis]]:
-    """Candidates in whose place the winner may stand, refitted without it, where it leaves something."""
+    """Candidates in whose place the winner may stand, refitted without it, if something is unexplained."""
     if not is_unexplained(state.horizons, winner):
         return []
     before = tuple(t.listed for t in state.score_tests(state.origin))
@@ -199,13 +201,13 @@ def _refit_replaced(
 
 
 def add_pair(state: SearchState, rounds: int) -> bool:
-    """Add two effects that are needed together, where something is left; False where there are none.
+    """Add two effects that are needed together, if something is unexplained; False if no pair passes.
 
-    They are sought beside the current model alone, not beside the nominal one.
+    Pairs are added to the current model only, not to the nominal one.
 
     Args:
-        state: What was found so far.
-        rounds: Most effects that the search may add.
+        state: The search with what it has found so far.
+        rounds: Largest number of effects that the search may add.
     """
     if len(state.scores) + 2 > rounds:
         return False

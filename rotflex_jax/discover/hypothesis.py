@@ -19,8 +19,8 @@ from rotflex_jax.parameters import Transform
 class Whitener:
     """`w = L e`: innovations that are white in time, with a covariance of their channels.
 
-    An autoregression fitted to the innovations of an incomplete model would also take away the slow error
-    that the missing effect makes, and with it the power to name the effect.
+    An autoregression fitted to the innovations of an incomplete model would also remove the slow error that
+    the missing effect causes, and with it the power to identify the effect.
 
     Attributes:
         L: Inverse Cholesky factor of the covariance.
@@ -30,7 +30,7 @@ class Whitener:
 
     @classmethod
     def of_noise(cls, noise: Float[np.ndarray, " C"]) -> "Whitener":
-        """White errors with these standard deviations, each channel apart."""
+        """The whitener of uncorrelated channels with these standard deviations."""
         return cls(np.diag(1 / noise))
 
     @property
@@ -42,8 +42,7 @@ class Whitener:
         self, e: Float[np.ndarray, "*batch R N C"], seen: Float[np.ndarray, "R N"]
     ) -> Float[np.ndarray, "*batch R N C"]:
         """Whitened signals; zero where a sample does not count."""
-        # Channel by channel: a product of matrices this thin takes several times as long for many
-        # signals.
+        # Channel by channel, since a product with such a small matrix takes several times as long.
         w = np.empty(e.shape)
         for i, row in enumerate(self.L):
             first, *others = [j for j in range(len(row)) if row[j] != 0]
@@ -74,7 +73,7 @@ def fit_whitener(
     Args:
         e: Innovations.
         seen: One where a sample counts.
-        floor: Standard deviation below which nothing is believed; guards noise-free data.
+        floor: Standard deviation of the sensor noise; 5 % of it is added, for data without noise.
         channels_apart: Whether the innovations of different channels count as uncorrelated.
     """
     C = e.shape[-1]
@@ -91,17 +90,17 @@ class Hypothesis:
 
     Attributes:
         locations: Candidates and calibrations that are switched on, in the order they were added.
-        free: Parameters common to all recordings that are fitted.
-        local: Parameters that each recording has for itself and that are fitted.
+        free: Indices of fitted parameters that are common to all recordings.
+        local: Indices of fitted parameters that have a value for each recording (calibrations).
         z: Unconstrained values of all parameters.
         local_z: Unconstrained values of the local parameters of each recording.
-        x0: First states of the windows: positions, speeds, and what else the reduced model has.
+        x0: First states of the windows: positions, speeds, and further states of the reduced model.
         K: Gains of the predictor; zero for free runs.
-        process_noise: Port -> intensity that gave `K` [(N m)^2 s].
-        whitener: Fixed while parameters move.
+        process_noise: Port -> intensity of the process noise that gave `K` [(N m)^2 s].
+        whitener: Whitener of the innovations, fixed while parameters move.
         densities: Log-likelihood of each sample [nat]; minus infinity before it is evaluated.
-        blocks: What each half second says for the hypothesis, to be compared with another one on the same
-            recordings: its log-likelihood [nat], or for free runs minus the logarithm of its error.
+        blocks: Evidence of each half second, for the comparison with another hypothesis on the same
+            recordings: log-likelihood [nat], or for free runs minus the logarithm of the error.
     """
 
     locations: tuple[EffectLocation, ...]
@@ -121,21 +120,21 @@ class Hypothesis:
     def initial_state_for(
         self, s: SuperModel, locations: tuple[EffectLocation, ...]
     ) -> Float[np.ndarray, "R W m"]:
-        """First states with other effects on: what both have as it is, the rest at rest."""
+        """First states with other effects on; states that the hypothesis does not have start at rest."""
         return embed_initial_state(s, locations, self.x0, self.locations)
 
     @property
     def log_likelihood(self) -> float:
-        """Of the recordings [nat]."""
+        """Log-likelihood of the recordings [nat]."""
         total = float(np.sum(self.densities))
         return total if np.isfinite(total) else -np.inf
 
     def values(self, s: SuperModel) -> Float[np.ndarray, "R P"]:
-        """Physical values."""
+        """Physical values of all parameters in each recording."""
         return self.physical(s)[0]
 
     def mean_values(self, s: SuperModel) -> Float[np.ndarray, " P"]:
-        """Physical values, of local parameters the mean over recordings; of phases those of the first one."""
+        """Physical values; local parameters have their mean over recordings, phased ones the first value."""
         values, phased = self.values(s), [i for i in self.local if i in s.phased]
         mean = values.mean(axis=0)
         mean[phased] = values[0, phased]
@@ -149,16 +148,16 @@ class Hypothesis:
         return s.transform.physical(z)
 
     def parameter_set(self, s: SuperModel) -> ParameterSet:
-        """What it runs with."""
+        """The parameter set with which it runs."""
         return ParameterSet(self.values(s), self.x0, s.gates(self.locations), self.K)
 
     @property
     def moved(self) -> int:
-        """Number of directions that a fit moves: common, then local, then first states."""
+        """Number of coordinates that a fit moves: common parameters, local parameters, first states."""
         return len(self.free) + len(self.local) + self.x0.shape[-1]
 
     def directions(self, s: SuperModel, count: int) -> Directions:
-        """Directions of all that a fit moves, in unconstrained coordinates, filled up with zeros."""
+        """Directions of all unconstrained coordinates that a fit moves, filled up with zeros to `count`."""
         (R, _, m), P, E = self.x0.shape, len(self.z), len(s.mechanism.effects)
         derivative = self.physical(s)[1]
         d = Directions(np.zeros((count, R, P)), np.zeros((count, m)), np.zeros((count, E)))
@@ -175,13 +174,15 @@ def embed_initial_state(
     x0: Float[np.ndarray, "*batch k"],
     of: tuple[EffectLocation, ...] = (),
 ) -> Float[np.ndarray, "*batch m"]:
-    """First states with some effects on from those with other effects on.
+    """First states of a model with some effects on, from known states of a model with other effects on.
+
+    States that are not known start at rest.
 
     Args:
         s: The super-model.
-        locations: What is switched on.
-        x0: States known; positions and speeds are enough.
-        of: What is switched on where they come from.
+        locations: Effects that are on in the new model.
+        x0: Known states; positions and speeds are enough.
+        of: Effects that are on in the model of the known states.
     """
     before, after = (list(s.active(s.gates(on)).states) for on in (of, locations))
     full = np.tile(rest_state(s.mechanism.structure, np.float64), (*x0.shape[:-1], 1))
@@ -195,9 +196,9 @@ class CandidateStart:
 
     Attributes:
         location: Effect and port.
-        values: Parameter values.
-        others: Values at the next best shapes.
-        expected_gain: Log-likelihood that the score test expects [nat]; 0 where there was none.
+        values: Parameter values of the candidate.
+        others: Parameter values at the next best shapes.
+        expected_gain: Gain in log-likelihood that the score test expects [nat]; 0 without a score test.
     """
 
     location: EffectLocation
@@ -207,13 +208,13 @@ class CandidateStart:
 
 
 def usual_start(s: SuperModel, location: EffectLocation) -> CandidateStart:
-    """A candidate at its usual sizes, of every shape."""
+    """A start of a candidate at its usual sizes, for each of its shapes."""
     first, *others = (np.array(shape).max(axis=0) for shape in s.candidates[location].probes)
     return CandidateStart(location, first, tuple(others))
 
 
 def with_candidate(s: SuperModel, h: Hypothesis, start: CandidateStart, share: float) -> Hypothesis:
-    """The hypothesis with one more effect, or with it in the place of simpler ones that it contains."""
+    """The hypothesis with one more effect; an effect with memory replaces simpler ones that it contains."""
     name, port = start.location
     simpler = [EffectLocation(c, port) for c in CATALOG[name].contains if (c, port) in h.locations]
     if not simpler or CATALOG[name].state_part != "memory":
@@ -224,7 +225,7 @@ def with_candidate(s: SuperModel, h: Hypothesis, start: CandidateStart, share: f
 def replacing(
     s: SuperModel, h: Hypothesis, simpler: Sequence[EffectLocation], start: CandidateStart, share: float
 ) -> Hypothesis:
-    """The hypothesis with a richer effect in the place of simpler ones, whose parameters it takes over."""
+    """The hypothesis with a richer effect that replaces simpler ones and takes over their parameters."""
     values, known = h.mean_values(s), {}
     for location in simpler:
         indices = s.parameter_indices(location)
@@ -235,19 +236,19 @@ def replacing(
     for k, i in enumerate(c.parameters):
         parameter = s.mechanism.parameter_names[i].rpartition(".")[2]
         if parameter in known:
-            # What the simpler effect has already keeps its size; the share is for the rest.
+            # Parameters of the simpler effect keep their size; only other amplitudes get the share.
             own[k] = known[parameter] / (share if c.amplitudes[k] else 1.0)
     return with_effect(s, h, dataclasses.replace(start, values=own), share)
 
 
 def with_effect(s: SuperModel, h: Hypothesis, start: CandidateStart, share: float) -> Hypothesis:
-    """The hypothesis with one more effect, at a share of the amplitude of its start."""
+    """The hypothesis with one more effect, at a share of the amplitudes of its start."""
     c = s.candidates[start.location]
     specs = [s.mechanism.parameter_specifications[i] for i in c.parameters]
     size = np.abs(np.array(c.probes[0])).max(axis=0)
     values = np.where(c.amplitudes, share * start.values, start.values)
     for k, spec in enumerate(specs):
-        # A bound at zero is the end of a logarithm: start a little inside.
+        # A lower bound is at minus infinity of the unconstrained coordinate, so the start is a little above.
         if np.isfinite(spec.lower) and k != c.line:
             values[k] = max(values[k], spec.lower + 0.05 * share * max(size[k], 1e-12))
     z = h.z.copy()
@@ -270,7 +271,7 @@ def with_effect(s: SuperModel, h: Hypothesis, start: CandidateStart, share: floa
 
 
 def without(s: SuperModel, h: Hypothesis, location: EffectLocation) -> Hypothesis:
-    """The hypothesis less one effect, its other parameters as they are."""
+    """The hypothesis without one effect, with all other parameters unchanged."""
     removed = set(s.parameter_indices(location))
     kept = [k for k, i in enumerate(h.local) if i not in removed]
     locations = tuple(p for p in h.locations if p != location)
@@ -285,9 +286,10 @@ def without(s: SuperModel, h: Hypothesis, location: EffectLocation) -> Hypothesi
 
 
 def law_with_its_size(locations: Sequence[EffectLocation], location: EffectLocation) -> EffectLocation | None:
-    """The law of dry friction among some effects that contains another one and has its size; None if none.
+    """The law of dry friction, among some effects, that can take over the size of another one; None if none.
 
-    Coulomb friction beside Stribeck friction is Stribeck friction with the sum of the levels.
+    The law contains the other one and has an amplitude of the same name. Coulomb friction beside Stribeck
+    friction, for example, is Stribeck friction with the sum of the two levels.
     """
     if law_of(location.effect) != DRY_FRICTION:
         return None
@@ -301,7 +303,7 @@ def _common_sizes(a: EffectLocation, b: EffectLocation) -> list[str]:
 
 
 def handed_over(s: SuperModel, h: Hypothesis, location: EffectLocation) -> Hypothesis | None:
-    """The hypothesis less one effect, whose size goes to `law_with_its_size`; None without such a law."""
+    """The hypothesis without one effect, whose size is added to `law_with_its_size`; None without a law."""
     law = law_with_its_size(h.locations, location)
     if law is None:
         return None
@@ -315,7 +317,7 @@ def handed_over(s: SuperModel, h: Hypothesis, location: EffectLocation) -> Hypot
 
 
 def with_all_calibrations(s: SuperModel, h: Hypothesis) -> Hypothesis:
-    """The hypothesis with every calibration of the super-model, those that it lacks at zero."""
+    """The hypothesis with every calibration of the super-model; calibrations that it lacked start at zero."""
     missing = [p for p in s.calibrations if p not in h.locations]
     added = tuple(i for p in missing for i in s.parameter_indices(p))
     locations = (*h.locations, *missing)
@@ -329,12 +331,12 @@ def with_all_calibrations(s: SuperModel, h: Hypothesis) -> Hypothesis:
 
 
 def parameter_count(s: SuperModel, h: Hypothesis, location: EffectLocation) -> int:
-    """How many numbers an effect takes, those of each recording counted one by one."""
+    """Number of values that an effect adds to a fit; a local parameter counts once for each recording."""
     return sum(len(h.x0) if i in h.local else 1 for i in s.parameter_indices(location))
 
 
 def is_physical(s: SuperModel, h: Hypothesis, location: EffectLocation) -> bool:
-    """Whether the parameters of an effect lie in their physical range."""
+    """Whether all parameters of an effect lie in their physical ranges."""
     values, specs = h.mean_values(s), s.mechanism.parameter_specifications
     return all(
         specs[i].physical[0] <= values[i] <= specs[i].physical[1] for i in s.parameter_indices(location)
@@ -342,10 +344,10 @@ def is_physical(s: SuperModel, h: Hypothesis, location: EffectLocation) -> bool:
 
 
 def generalisations(s: SuperModel, h: Hypothesis) -> list[CandidateStart]:
-    """Effects with memory that contain another one that is on, as starts.
+    """Starts of candidates that contain an effect with memory that is on.
 
-    The search adds effects, but such an effect is not the simpler one and something more, and its slope at
-    shapes that are far from the one found is not informative.
+    The score test cannot rate such a candidate: it is no sum of the simpler effect and a further one, and its
+    slope at shapes far from the shape that was found is not informative.
     """
     out = []
     for location, c in s.candidates.items():

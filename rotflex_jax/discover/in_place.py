@@ -1,9 +1,9 @@
-"""Other laws in the places of the effects of a final model that leaves much, and which of them remain.
+"""Replacement of effects of a poor final model by other laws, and rivals that remain possible.
 
-What a model lacks besides suits one law of friction better than another, and a round refits only the laws
-that its scores put forward. At the end every other law of the same thing (`Effect.law_of`) and every rival of
-its round take the place of an effect, fitted at both horizons. A law that one horizon prefers beyond doubt
-stays there, where the other one allows it (`better_in_place`).
+Whatever else a model lacks may favour one law of friction, and a round refits only the laws with the best
+scores. So at the end of a search, every other law of the same thing (`Effect.law_of`) and every rival of its
+round is fitted in the place of an effect, at both horizons. A law replaces the effect if one horizon clearly
+prefers it and the other one does not object (`better_in_place`).
 """
 
 import dataclasses
@@ -32,14 +32,15 @@ from rotflex_jax.parameters import bound_reached
 def laws_in_question(
     state: SearchState, location: EffectLocation, on: Sequence[EffectLocation]
 ) -> list[EffectLocation]:
-    """Laws that may describe better what an effect was found for, from measured first states.
+    """Laws that the final fit tries in the place of an effect, from measured first states.
 
-    They are those of the same thing that the search cannot exclude in its place, and those that contain it.
+    They are the laws of the same thing that the search cannot exclude in its place, and the laws that contain
+    it.
 
     Args:
-        state: A search that is done, with the rivals that remain.
-        location: An effect of the model; no law is in question for one of the model as it was given, nor for
-            one that is no law.
+        state: A finished search, with the rivals that remain.
+        location: An effect of the model. There are no laws for an effect of the user's model, or for an
+            effect that is no law.
         on: All effects of the model.
     """
     if location not in state.scores:
@@ -51,17 +52,17 @@ def laws_in_question(
 
 
 def take_better_laws(state: SearchState) -> tuple[str, ...]:
-    """Put laws that data prefer (`better_in_place`) in the places of effects of a poor model.
+    """Replace effects of a poor model by laws that the data prefer (`better_in_place`).
 
     Args:
-        state: A search that is done.
+        state: A search that has added its effects and left out those not needed.
 
     Returns:
-        What has taken which place, in sentences.
+        A sentence on each replacement.
     """
     s, notes = state.problem.supermodel, []
     for location in list(state.scores):
-        if location not in state.current.hypothesis.locations:  # from the start, or by a law that contains it
+        if location not in state.current.hypothesis.locations:  # left out before, or replaced by another law
             continue
         laws = [p for p in s.other_laws(location) if p not in state.current.hypothesis.locations]
         known = _as_found(state, location)
@@ -88,9 +89,9 @@ def take_better_laws(state: SearchState) -> tuple[str, ...]:
 
 
 def _shape_at_bound(s: SuperModel, rival: ValidatedHypothesis, known: ValidatedHypothesis) -> bool:
-    """Whether the shape of a law that is preferred ends at a bound: what the data ask for is another law.
+    """Whether a preferred law has a shape parameter at a bound, so that the data need yet another law.
 
-    Where predictions do not prefer it, its shape there says nothing.
+    The fit to predictions counts only if predictions prefer the law.
     """
     assert rival.location and rival.free_run
     c, specs = s.candidates[rival.location], s.mechanism.parameter_specifications
@@ -101,16 +102,17 @@ def _shape_at_bound(s: SuperModel, rival: ValidatedHypothesis, known: ValidatedH
 
 
 def _as_found(state: SearchState, location: EffectLocation) -> ValidatedHypothesis:
-    """The final model as a candidate with one of its effects."""
+    """The final model, marked as a candidate with one of its effects."""
     count = parameter_count(state.problem.supermodel, state.current.hypothesis, location)
     return dataclasses.replace(state.current, location=location, parameter_count=count)
 
 
 def undecided_rivals(state: SearchState) -> dict[EffectLocation, list[EffectLocation]]:
-    """Effects that were found -> those that data do not exclude in their places, of an unexplained model.
+    """Effects of a poor model -> effects that the data do not exclude in their places.
 
     Args:
-        state: A search that is done, with rivals of its rounds. What is fitted joins `tried`.
+        state: A search that has added its effects, with the rivals of its rounds. Models that are fitted join
+            `state.tried`.
     """
     s, found = state.problem.supermodel, list(state.scores)
     final = state.current
@@ -123,7 +125,8 @@ def undecided_rivals(state: SearchState) -> dict[EffectLocation, list[EffectLoca
         fitted = _in_place(state, location, [p for p in rivals if not CATALOG[p.effect].line])
         for rival in fitted:
             state.say(f"  in the place of {location}, " + describe(rival, final))
-        # One that is refitted at its line has passed already beside the models of its round.
+        # A periodic disturbance remains a rival without a test: it was refitted at its frequency in its
+        # round.
         remaining[location] = [p for p in rivals if CATALOG[p.effect].line]
         measured = state.problem.measured_values
         remaining[location] += [
@@ -135,7 +138,7 @@ def undecided_rivals(state: SearchState) -> dict[EffectLocation, list[EffectLoca
 def _in_place(
     state: SearchState, location: EffectLocation, rivals: Sequence[EffectLocation]
 ) -> list[ValidatedHypothesis]:
-    """The final model with each rival in the place of an effect, at both horizons; known ones as they are."""
+    """The final model with each rival in the place of an effect, fitted at both horizons unless known."""
     s, final = state.problem.supermodel, state.current
     assert final.free_run
     others = s.without_calibrations(final.hypothesis.locations) - {location}

@@ -1,4 +1,4 @@
-"""A torque learned from recordings where no effect of the catalogue explains what is left."""
+"""A torque learned as a map of position and speed, where no effect of the catalogue explains what is left."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -30,30 +30,31 @@ from rotflex_jax.runtime.persistent_jit import clear_compilation_caches
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-# Cells of the map along each axis; a cell counts as visited with so many samples.
+# Number of cells of the map along each axis, and least number of samples in a cell that counts as visited.
 MAP_CELLS, MIN_CELL_SAMPLES = 30, 3
-# Splines along position and speed.
+# Number of splines along position and along speed.
 SPLINES = (8, 15)
-# Share of the usual speed below which the map is even in it.
+# Share of the usual speed below which the splines are equally wide; at higher speeds they are wider.
 EVEN_SPEED_SHARE = 0.1
 
 
 @dataclasses.dataclass(frozen=True)
 class LearnedTorqueResult:
-    """A learned torque, what it gains, and its formula.
+    """A learned torque with its gain, its map and its formula.
 
     Attributes:
-        at: Port.
-        kept: Whether the validation data are better explained with it.
-        effect: The learned map; zero where it was not kept.
-        before: The model without it, refitted and evaluated.
-        after: With it; the same as `before` where it was not kept.
-        held_out_gain_nats: What it gains in log-likelihood of the validation data [nat].
-        formula: The formula that comes nearest to it; empty where it was not kept.
-        physics: Terms that the model's own damper, spring or offset give at the port; none is in the map.
-        covariance: Of the weights [(N m)^2].
-        position: Of the port along the training recordings [rad].
-        speed: [rad/s].
+        at: Port of the torque.
+        kept: Whether the torque was kept: whether it explains the validation data better.
+        effect: The learned map; zero if it was not kept.
+        before: The model without the torque, refitted and evaluated.
+        after: The model with the torque; `before` if it was not kept.
+        held_out_gain_nats: Gain in log-likelihood of the validation data [nat].
+        formula: The formula nearest to the map; empty if the map was not kept.
+        physics: Terms that the model's own offset, damper or spring gives at the port; the map has none of
+            them.
+        covariance: Covariance of the weights of the map [(N m)^2].
+        position: Position of the port along the training recordings [rad].
+        speed: Speed of the port along the training recordings [rad/s].
         noise_floor: Channel -> standard deviation of the sensor noise.
     """
 
@@ -72,7 +73,7 @@ class LearnedTorqueResult:
 
     @property
     def model(self) -> Model:
-        """The model with the learned torque, or without where it was not kept."""
+        """The model with the learned torque, or without it if it was not kept."""
         return self.after.model
 
     @property
@@ -85,7 +86,8 @@ class LearnedTorqueResult:
     ) -> tuple[Float[np.ndarray, "..."], Float[np.ndarray, "..."]]:
         """Learned torque and its standard deviation [N m] at positions [rad] and speeds [rad/s] of the port.
 
-        What the physics of the model can imitate is not in it: beside a damper it has no slope.
+        It contains nothing that the physics of the model can imitate: if the port has a damper, it has no
+        part proportional to the speed.
         """
         q, w = np.broadcast_arrays(np.asarray(position, float), np.asarray(speed, float))
         Phi = self.effect.design(q.ravel(), w.ravel())
@@ -95,18 +97,18 @@ class LearnedTorqueResult:
     def read_torque(
         self, position: float | Real[np.ndarray, "..."], speed: float | Real[np.ndarray, "..."]
     ) -> Float[np.ndarray, "..."]:
-        """Torque of the formula [N m], less what the model's own terms can imitate, as in the map."""
+        """Torque of the formula [N m], without what the model's own terms can imitate, as in the map."""
         own = columns(self.physics, self.position, self.speed)
         held = np.linalg.lstsq(own, self.formula(self.position, self.speed), rcond=None)[0]
         q, w = np.broadcast_arrays(np.asarray(position, float), np.asarray(speed, float))
         return self.formula(q, w) - (columns(self.physics, q.ravel(), w.ravel()) @ held).reshape(q.shape)
 
     def visited(self, edges: Sequence[Float[np.ndarray, " _"]]) -> Bool[np.ndarray, "Q S"]:
-        """Which cells of a grid over position and speed the recordings have been in."""
+        """Which cells of a grid over position and speed the recordings have visited."""
         return np.histogram2d(self.position, self.speed, [*edges])[0] >= MIN_CELL_SAMPLES
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain JSON types; the map on a grid, None where the recordings have not been."""
+        """Plain JSON types; the map on a grid, None in cells that the recordings have not visited."""
         edges = tuple(np.linspace(*ends, MAP_CELLS + 1) for ends in (self.effect.position, self.effect.speed))
         q, w = ((e[1:] + e[:-1]) / 2 for e in edges)
         seen, (torque, std) = self.visited(edges), self.torque(q[:, None], w[None, :])
@@ -137,7 +139,7 @@ class LearnedTorqueResult:
         }
 
     def plot(self) -> "Figure":
-        """The map, greyed where the recordings have not been, its profiles with bands, and the formula."""
+        """Figure of the map (grey where recordings have not been), its profiles with bands, the formula."""
         from rotflex_jax.discover.learned_torque_figure import learned_figure  # the layer above, on request
 
         return learned_figure(self)
@@ -156,7 +158,7 @@ class LearnedTorqueResult:
 def columns(
     terms: Sequence[str], position: Float[np.ndarray, " N"], speed: Float[np.ndarray, " N"]
 ) -> Float[np.ndarray, "N T"]:
-    """Terms of a formula at samples."""
+    """Values of terms of a formula at samples, one column per term."""
     return np.stack([Term(t, 0.0)(position, speed) for t in terms], axis=1)
 
 
@@ -169,18 +171,20 @@ def learn_torque(
     window_seconds: float = 2.0,
     progress: Callable[[str], None] | None = None,
 ) -> LearnedTorqueResult:
-    """Learn a torque as a smooth map of position and speed of a port, and read it as a formula.
+    """Learn a torque as a smooth map of position and speed of a port, and approximate it by a formula.
 
-    The map is fitted through the simulator together with the model, whose parameters it cannot imitate;
-    how smooth it is, the recordings decide. It is kept only if the validation recordings become likelier,
-    so that a model that lacks nothing stays as it is. Use it where a search ends `unexplained`.
+    The map is fitted through the simulator together with the parameters of the model, which it cannot
+    imitate. Its smoothness is estimated from the recordings. The map is kept only if the validation
+    recordings become likelier, so that a model that lacks nothing stays unchanged. Use it where a search ends
+    `unexplained`.
 
-    Not for what depends on time, on the past or on the voltage: the result then explains little.
+    Do not use it for a torque that depends on time, on the past or on the voltage: the map then explains
+    little.
 
     Args:
         model: The model so far, with the effects that were found.
-        train: Recordings to fit.
-        validation: Recordings that no fit sees, which decide whether the map is kept.
+        train: Training recordings, to which model and map are fitted.
+        validation: Validation recordings, which decide whether the map is kept.
         at: Port of the torque.
         window_seconds: Length of the windows of the short validation runs [s].
         progress: Called with a line of text at each stage.
@@ -189,7 +193,8 @@ def learn_torque(
         The model with the map, its errors, the map with standard deviations, and its formula.
 
     Raises:
-        InputError: A port that does not exist or that the outputs do not determine, or a map already there.
+        InputError: If the port does not exist, if the outputs do not determine its motion, or if the model
+            already has a learned torque there.
     """
     clear_compilation_caches()
     model, say = Model.of(model), checks.progress(progress)
@@ -220,7 +225,7 @@ def learn_torque(
     fitted = fit_map(problem, current.hypothesis, effect, weights, excluded, size)
     candidate = validate(unseen, fitted.hypothesis)
     if effect.count[0] > 1 and not fitted.flat:
-        # Where validation data lie beyond the positions seen, a map of speed alone may be the better one.
+        # If validation data lie beyond the positions of training, a map of speed alone may be the better one.
         excluded = np.hstack([excluded, position_differences(effect).T])
         flat = fit_map(problem, current.hypothesis, effect, weights, excluded, size)
         of_speed = validate(unseen, flat.hypothesis)
@@ -228,7 +233,7 @@ def learn_torque(
             fitted, candidate = flat, of_speed
     gain, z = paired_gain(candidate.blocks, current.blocks)
     runs_as_well = np.all(candidate.window_rmse < (1 + WINDOWS_WORSE) * current.window_rmse)
-    # As an effect of the catalogue is.
+    # The same limits as for an effect of the catalogue.
     kept = bool(gain > HELD_OUT_NATS and z > HELD_OUT_Z and runs_as_well)
     say(f"learned torque: {gain:.0f} nat on validation data, {'kept' if kept else 'not kept'}")
     before = _without_map(evaluate(problem, unseen, model.solver, current, s.calibrations), at)
@@ -251,7 +256,7 @@ def learn_torque(
 
 
 def _motion(model: Model, recordings: Sequence[Recording], at: str) -> tuple[np.ndarray, np.ndarray]:
-    """Position and speed of a port along the recordings."""
+    """Measured position and speed of a port along the recordings."""
     m = model.mechanism
     if at not in m.port_vectors:
         raise InputError(
@@ -272,7 +277,7 @@ def _motion(model: Model, recordings: Sequence[Recording], at: str) -> tuple[np.
 
 
 def _zero_map(at: str, position: np.ndarray, speed: np.ndarray, torque: float) -> LearnedTorque:
-    """A map of zero torque over the range of the port."""
+    """A map of zero torque over the range of positions and speeds of a port."""
     usual = max(float(np.sqrt(np.mean(speed**2))), 1e-9)
     ranges = []
     for x in (position, speed):
@@ -289,7 +294,7 @@ def _zero_map(at: str, position: np.ndarray, speed: np.ndarray, torque: float) -
 
 
 def _own_terms(m: Mechanism, at: str) -> tuple[str, ...]:
-    """Terms that an offset of the recording, and dampers and springs at the port, give there."""
+    """Terms that an offset of the recording, dampers and springs give at a port."""
     stamps = {e.name: e.stamp() for e in m.linear_effects(at)}
     damped = Viscous.name in stamps or any(float(s.damping) for s in stamps.values())
     sprung = any(float(s.stiffness) for s in stamps.values())
@@ -297,7 +302,7 @@ def _own_terms(m: Mechanism, at: str) -> tuple[str, ...]:
 
 
 def _without_map(stage: Stage, at: str) -> Stage:
-    """The stage of the model without the map, whose weights are all zero there."""
+    """The stage of the model without the map, whose weights are all zero in this stage."""
     head, m = name_prefix(at, LearnedTorque.name), stage.model.mechanism
     return dataclasses.replace(
         stage,

@@ -1,4 +1,4 @@
-"""The figure of a learned torque: its map where the recordings have been, its profiles, its formula."""
+"""The figure of a learned torque: its map where the recordings have been, two profiles, and its formula."""
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -9,13 +9,13 @@ from rotflex_jax.text.colours import BASELINE, FINAL, INK, MUTED
 from rotflex_jax.text.numbers import equation, readable
 from rotflex_jax.text.plotting import blank, legend_above, styled
 
-# Cells of the map along each axis, and points of a profile.
+# Number of cells of the map along each axis, and of points of a profile.
 LEARNED_MAP_CELLS, PROFILE_POINTS = 36, 200
 
 
 @styled
 def learned_figure(result: LearnedTorqueResult) -> Figure:
-    """Map over position and speed, greyed where the recordings have not been, and a cut along each axis."""
+    """Map over position and speed, grey where the recordings have not been, and a profile along each axis."""
     effect = result.effect
     ranges = (effect.position, effect.speed)
     edges = tuple(np.linspace(*ends, LEARNED_MAP_CELLS + 1) for ends in ranges)
@@ -38,7 +38,7 @@ def learned_figure(result: LearnedTorqueResult) -> Figure:
     left.set_ylabel(f"speed of the {result.at} [{rate}]")
     figure.colorbar(mesh, ax=left, label=f"torque [{own.effort}]")
     usual = [float(np.median(x)) for x in (result.position, result.speed)]
-    # The cut along the position is taken at a speed that is met often but is not rest.
+    # The profile along the position is taken at a usual speed, but not at rest.
     moving = float(np.median(np.abs(result.speed)))
     w, q = np.linspace(*effect.speed, PROFILE_POINTS), np.linspace(*effect.position, PROFILE_POINTS)
     for ax, at, x in (

@@ -1,10 +1,10 @@
 """The likelihood of recordings under a hypothesis, and the refits that maximise it.
 
-A search uses two horizons. The one-step prediction uses every sample, but where another part of the model is
-wrong its state follows the data within a few samples, and what acts slowly is no longer visible. A free run
-over a few seconds shows what acts slowly. It is a predictor with no gain, which starts again at each window.
-Its errors are alike from sample to sample, although its likelihood is that of independent errors; so gains of
-it count by their scatter between blocks of time.
+A search uses two horizons. A one-step prediction uses every sample. But where another part of the model is
+wrong, its state follows the data within a few samples, and slow effects are no longer visible. A free run
+over a few seconds shows slow effects. It is a predictor with gain zero that starts again at each window. Its
+errors are correlated from sample to sample, although its likelihood assumes independent errors. So its gains
+are judged by their scatter between blocks of time.
 """
 
 import dataclasses
@@ -25,14 +25,14 @@ from rotflex_jax.optimise.damped_least_squares import LARGEST_STEP, NormalEquati
 from rotflex_jax.runtime.persistent_jit import make_ahead
 from rotflex_jax.runtime.xla import on_threads
 
-# Hypotheses are compared block by block, so that the scatter shows what is chance.
+# Length of the blocks by which hypotheses are compared [s]. The scatter of the blocks shows what is chance.
 BLOCK_SECONDS = 0.5
-# Value of a block where a model diverges: finite, so that it can be compared.
+# Value of a block where a model diverges; finite, so that blocks can be compared.
 DIVERGED = -1e9
-# Errors beyond so many times the noise of a sensor are those of a run that diverges.
+# A run diverges if its errors exceed this many times the noise of a sensor.
 LARGEST_ERROR = 1e6
-# Least and largest process torque, as shares of the intensity that a torque as large as the motor's, drawn
-# again at each sample, would have.
+# Least and largest process noise that is tried, as shares of the intensity of a random torque that is as
+# large as the motor's torque and drawn again at each sample.
 MIN_PROCESS_NOISE_SHARE, MAX_PROCESS_NOISE_SHARE = 1e-9, 1e-3
 
 
@@ -42,10 +42,10 @@ class LikelihoodProblem:
 
     Attributes:
         predictor: Runs hypotheses on the dataset.
-        dataset: The recordings, with the noise and the torque that scale the comparison.
-        ports: Ports at which process torques act.
-        windows: Where runs start again.
-        free_run: Whether no measurement corrects the state.
+        dataset: The recordings, with the sensor noise and the torque scale.
+        ports: Ports at which process noise acts.
+        windows: Windows at whose beginnings runs start again.
+        free_run: Whether runs are free runs, in which no measurement corrects the state.
     """
 
     predictor: BatchedPredictor
@@ -71,22 +71,22 @@ class LikelihoodProblem:
         return dataclasses.replace(self, windows=windows, free_run=True)
 
     def first_seconds(self, seconds: float) -> "LikelihoodProblem":
-        """The same with the first seconds of each recording alone; nothing after them counts."""
+        """The same likelihood of only the first seconds of each recording."""
         data = self.dataset.data
         return self.counting(np.arange(data.seen.shape[1]) * data.Ts[:, None] < seconds)
 
     def of_recordings(self, chosen: Sequence[int]) -> "LikelihoodProblem":
-        """The same with some recordings alone; the others stay in place, for the sake of compiled code."""
+        """The same likelihood of only some recordings; arrays keep their shapes, for compiled code."""
         return self.counting(np.isin(np.arange(len(self.seen)), chosen)[:, None])
 
     def counting(self, samples: Bool[np.ndarray, "R #N"]) -> "LikelihoodProblem":
-        """The same where only some samples count."""
+        """The same likelihood of only some samples."""
         data = self.dataset.data
         data = data._replace(seen=data.seen * samples)
         return self.of_dataset(dataclasses.replace(self.dataset, data=data))
 
     def of_dataset(self, dataset: Dataset) -> "LikelihoodProblem":
-        """The same with data of the same shape, which compiled programs take as arguments; windows stay."""
+        """The same likelihood of other data of the same shape, with the same windows and programs."""
         predictor = dataclasses.replace(self.predictor, data=dataset.data)
         return dataclasses.replace(self, predictor=predictor, dataset=dataset)
 
@@ -107,49 +107,52 @@ class LikelihoodProblem:
 
     @property
     def measured_values(self) -> float:
-        """How many values were measured."""
+        """Number of measured values that count."""
         return float(np.sum(self.seen)) * self.dataset.data.y.shape[-1]
 
     @property
     def direction_count(self) -> int:
-        """Directions per pass of slopes: enough for a few effects on top of the baseline."""
+        """Usual number of directions of slopes, enough for the baseline with a few effects."""
         s = self.supermodel
         count = len(s.baseline_free) + len(s.local) + 2 * len(s.baseline.coordinates) + 4
         return _multiple_of_four(count)
 
     def directions_of(self, h: Hypothesis) -> int:
-        """Directions per pass of the slopes of a hypothesis."""
+        """Number of directions of slopes that is used for a hypothesis."""
         return max(self.direction_count, _multiple_of_four(h.moved))
 
     @property
     def process_noise_range(self) -> tuple[float, float]:
-        """Least and largest intensity of process torques that is tried [(N m)^2 s].
+        """Least and largest intensity of process noise that is tried [(N m)^2 s].
 
-        The least is a free run in all but name. The largest keeps the memory of the predictor long
-        against the sampling period: a predictor that forgets within a few samples follows any motion
-        and no longer distinguishes one model from another, whatever its likelihood.
+        With the least, the predictor is practically a free run. With the largest, its memory is still long
+        compared with the sampling period: a predictor that forgets within a few samples follows any motion,
+        and its likelihood no longer distinguishes one model from another.
         """
         unit = self._intensity(self.dataset.torque_scale)
         return MIN_PROCESS_NOISE_SHARE * unit, MAX_PROCESS_NOISE_SHARE * unit
 
     def least_process_noise(self, h: Hypothesis) -> float:
-        """The least intensity by the motor of a hypothesis, not by that of the user's model [(N m)^2 s]."""
+        """Least intensity of process noise, from the motor torque of a hypothesis [(N m)^2 s].
+
+        `process_noise_range` uses the motor torque of the user's model instead.
+        """
         s = self.supermodel
         motor = torque_scale(s.clean(h.mean_values(s), ()), self.dataset.data)
         return MIN_PROCESS_NOISE_SHARE * self._intensity(motor)
 
     def _intensity(self, torque: float) -> float:
-        """Intensity of a torque that is drawn again at each sample [(N m)^2 s]."""
+        """Intensity of a random torque of this size that is drawn again at each sample [(N m)^2 s]."""
         return torque**2 * float(self.dataset.data.Ts[0])
 
     def with_process_noise(self, h: Hypothesis, intensity: dict[str, float]) -> Hypothesis:
-        """The hypothesis with the gains of another process noise."""
+        """The hypothesis with another process noise and its gains."""
         return dataclasses.replace(h, K=self.gains(h, [intensity])[0], process_noise=intensity)
 
     def gains(
         self, h: Hypothesis, intensities: Sequence[dict[str, float]]
     ) -> list[Float[np.ndarray, "R n C"]]:
-        """Gains of the baseline's linear part in each recording, one array per intensity."""
+        """Kalman gains of the baseline's linear part for each recording, one array per intensity."""
         s, periods, found = self.supermodel, np.asarray(self.dataset.data.Ts).tolist(), {}
         if self.free_run:
             shape = (len(periods), Layout.of(s.mechanism.structure).size, len(self.noise))
@@ -159,7 +162,7 @@ class LikelihoodProblem:
         keys = [(Ts, known.tobytes()) for Ts, known in rows]
         for key, (Ts, known) in zip(keys, rows, strict=True):
             if key not in found:
-                # A learned map has its parameters after those that may be constants of a recording.
+                # Parameters of a learned map come last; they are never constants of a recording.
                 values = mechanism.values.copy()
                 values[: len(known)] = np.where(np.isnan(known), values[: len(known)], known)
                 here = mechanism.with_values(values)
@@ -183,7 +186,7 @@ class LikelihoodProblem:
         return np.sqrt(np.mean(e**2, axis=0))
 
     def make_ahead(self, hypotheses: Sequence[Hypothesis]) -> None:
-        """Have the programs of innovations made for hypotheses whose slopes are needed first."""
+        """Compile programs of innovations on another thread, for hypotheses whose slopes are needed first."""
         s = self.supermodel
         for locations, h in {frozenset(h.locations): h for h in hypotheses}.items():
             if not self.predictor.has_innovations(s.gates(locations)):
@@ -192,10 +195,9 @@ class LikelihoodProblem:
     def slopes(
         self, hypotheses: Sequence[Hypothesis]
     ) -> tuple[Float[np.ndarray, "H R N C"], Float[np.ndarray, "H D R N C"]]:
-        """Innovations and their slopes along all that a fit moves.
+        """Innovations of hypotheses, and their slopes along all coordinates that a fit moves.
 
-        Directions are filled up to the same few numbers, whatever else is fitted beside a hypothesis: each
-        number is compiled once.
+        The number of directions is rounded up to one of a few numbers, since each number is compiled.
         """
         return self.predictor.slopes(*self._with_directions(hypotheses), self.windows.index)
 
@@ -204,7 +206,7 @@ class LikelihoodProblem:
         use: Callable[[int, Float[np.ndarray, "R N C"], Float[np.ndarray, "D R N C"]], Used],
         hypotheses: Sequence[Hypothesis],
     ) -> list[Used]:
-        """What a function gives for each hypothesis by its number, its innovations and their slopes."""
+        """Results of a function of the index, innovations and slopes of each hypothesis."""
         return self.predictor.of_slopes(use, *self._with_directions(hypotheses), self.windows.index)
 
     def _with_directions(
@@ -215,30 +217,30 @@ class LikelihoodProblem:
         return [h.parameter_set(s) for h in hypotheses], directions
 
     def whitener(self, e: Float[np.ndarray, "R N C"]) -> Whitener:
-        """The whitener that innovations give; of free runs the scale of each channel alone."""
+        """The whitener fitted to innovations; for free runs, channels count as uncorrelated."""
         return fit_whitener(e, self.seen, self.noise, channels_apart=self.free_run)
 
     def log_likelihood(self, e: Float[np.ndarray, "R N C"]) -> float:
-        """Log-likelihood of innovations under the whitener that they give [nat].
+        """Log-likelihood of innovations with the whitener that is fitted to them [nat].
 
-        Minus infinity where a run diverges.
+        It is minus infinity where a run diverges.
         """
         if self._diverges(e):
             return -np.inf
         return float(np.sum(self.whitener(e).log_densities(e, self.seen)))
 
     def log_likelihoods(self, hypotheses: Sequence[Hypothesis]) -> Float[np.ndarray, " H"]:
-        """Log-likelihoods of hypotheses as they are [nat], each with the whitener that it gives."""
+        """Log-likelihoods of hypotheses as they are [nat], each with a whitener fitted to its innovations."""
         parameter_sets = [h.parameter_set(self.supermodel) for h in hypotheses]
         each = self.predictor.of_innovations
         return np.array(each(lambda _, e: self.log_likelihood(e), parameter_sets, self.windows.index))
 
     def with_likelihood(self, h: Hypothesis) -> Hypothesis:
-        """The hypothesis as it is, run once, with the whitener and the likelihood that it has."""
+        """The hypothesis, run once, with the whitener and the likelihood of its innovations."""
         return self.evaluated(h, self.innovations([h])[0])
 
     def evaluated(self, h: Hypothesis, e: Float[np.ndarray, "R N C"]) -> Hypothesis:
-        """The hypothesis with the whitener and the likelihood that its innovations give."""
+        """The hypothesis with the whitener, the likelihood and the blocks of given innovations."""
         if self._diverges(e):
             scale = Whitener.of_noise(self.noise)
             blocks = np.full_like(in_blocks(self.seen, self.dataset.data), DIVERGED)
@@ -249,14 +251,15 @@ class LikelihoodProblem:
         return dataclasses.replace(h, whitener=whitener, densities=densities, blocks=blocks)
 
     def _diverges(self, e: np.ndarray) -> bool:
-        """Whether a run is not finite, or so far off that its covariance has no inverse any more."""
+        """Whether a run is not finite, or so far off that the covariance of its errors has no inverse."""
         return not np.all(np.isfinite(e)) or bool(np.any(np.abs(e) > LARGEST_ERROR * self.noise))
 
     def _error_blocks(self, e: np.ndarray) -> np.ndarray:
-        """Minus the logarithm of the error of each block, mean over channels.
+        """Minus the logarithm of the root mean square error of each block, mean over channels.
 
-        Errors of free runs are alike from sample to sample and large where the model drifts: as densities, a
-        few blocks would decide. What counts is by which factor the error falls, in every block alike.
+        Errors of free runs are correlated from sample to sample, and large where the model drifts. With
+        log-likelihoods, a few blocks would decide. Here the factor by which the error decreases counts, and
+        all blocks have the same weight.
         """
         data = self.dataset.data
         counts = in_blocks(data.seen, data)
@@ -270,13 +273,13 @@ def _multiple_of_four(count: int) -> int:
 
 
 def block_edges(N: int, Ts: float) -> Int[np.ndarray, " B"]:
-    """First sample of each block of N samples; the last, shorter block joins its neighbour."""
+    """First sample of each block of N samples; a shorter rest at the end joins the last block."""
     width = max(round(BLOCK_SECONDS / Ts), 1)
     return np.arange(0, max(N - width, 0) + 1, width)
 
 
 def in_blocks(values: Float[np.ndarray, "R N"], data: StackedRecordings) -> Float[np.ndarray, " B"]:
-    """Sums over blocks of each recording."""
+    """Sums over the blocks of each recording, for all recordings in one array."""
     out = []
     for row, seen, Ts in zip(values, data.seen, data.Ts, strict=True):
         N = int(seen.sum())
@@ -284,21 +287,21 @@ def in_blocks(values: Float[np.ndarray, "R N"], data: StackedRecordings) -> Floa
     return np.concatenate(out)
 
 
-# Levenberg-Marquardt stops on this decrease of the negative log-likelihood [nat]; a relative tolerance
-# leaves tens of nats on a long recording and makes false discoveries.
+# Levenberg-Marquardt stops at this decrease of the negative log-likelihood [nat]. A relative tolerance would
+# leave tens of nats on a long recording and cause false discoveries.
 MIN_DECREASE_NATS = 0.3
-# A small damping from the start, as a refit starts near its optimum. Refused steps raise it quickly: at 100 a
-# step is a hundredth of one down the gradient, and a fit whose cost does not fall along it ends.
+# The damping is small from the start, since a refit starts near its optimum. Refused steps raise it quickly.
+# At 100 a step is a hundredth of a scaled gradient step, and a fit whose cost does not fall by it ends.
 REFIT_RULES = Rules(enough=MIN_DECREASE_NATS, damping=1e-4, least=1e-9, increase=20, largest=100)
-# Steps tried of each fit.
+# Largest number of steps of a fit.
 MAX_STEPS = 12
-# Alternations of a refit beyond the usual number, and what such a one has to gain [nat].
+# Largest number of alternations of a refit beyond the usual number, and least gain of each of them [nat].
 EXTRA_ALTERNATIONS, EXTRA_ALTERNATION_NATS = 5, 10.0
 
 
 @dataclasses.dataclass
 class _Point:
-    """A hypothesis on the way of its fit, with its innovations once it was run."""
+    """A hypothesis during its fit, with its innovations once it was run."""
 
     hypothesis: Hypothesis
     innovations: Float[np.ndarray, "R N C"] | None = None
@@ -307,15 +310,15 @@ class _Point:
 def levenberg_marquardt(
     problem: LikelihoodProblem, hypotheses: Sequence[Hypothesis], max_steps: int = MAX_STEPS
 ) -> list[Hypothesis]:
-    """Hypotheses fitted with whiteners and process noise held, each with the whitener that it ends with."""
+    """Hypotheses fitted with fixed whiteners and process noise, and then evaluated with new whiteners."""
     return on_threads(lambda h: _fitted(problem, h, max_steps), hypotheses)
 
 
 def _fitted(problem: LikelihoodProblem, h: Hypothesis, max_steps: int = MAX_STEPS) -> Hypothesis:
-    """The same for one hypothesis."""
+    """One hypothesis, fitted as in `levenberg_marquardt`."""
     seen, coordinates = problem.seen, FitCoordinates.of(h, problem.windows)
 
-    # Slopes come with every trial: most steps are taken, and a run alone is not much cheaper.
+    # Every trial computes slopes too: most steps are accepted, and a run without slopes is not much cheaper.
     def linearise(point: _Point) -> NormalEquations:
         here = point.hypothesis
 
@@ -341,7 +344,7 @@ def _fitted(problem: LikelihoodProblem, h: Hypothesis, max_steps: int = MAX_STEP
 def _grid(
     center: dict[str, float], factors: Sequence[float] | Float[np.ndarray, " F"]
 ) -> list[dict[str, float]]:
-    """All combinations of factors on two axes; on more, one axis at a time."""
+    """Intensities times factors: all combinations for up to two ports, else one port at a time."""
     ports = list(center)
     if len(ports) <= 2:
         mesh = np.stack(np.meshgrid(*[factors] * len(ports), indexing="ij"), -1).reshape(-1, len(ports))
@@ -353,10 +356,16 @@ def _grid(
 
 
 def choose_process_noise(problem: LikelihoodProblem, h: Hypothesis, wide: bool = False) -> Hypothesis:
-    """The process noise under which the innovations are likeliest, within `process_noise_range`.
+    """The hypothesis with the likeliest process noise within `process_noise_range`, found on a grid.
 
-    Zero is a free run, a large intensity follows the data within a few samples. Where the model is right, the
-    smallest value of the grid is the likeliest; where another one is, something is missing.
+    With intensity zero the predictor is a free run; with a large intensity it follows the data within a few
+    samples. If the model is right, the least intensity of the grid is the likeliest. If a larger one is, the
+    model lacks something.
+
+    Args:
+        problem: The likelihood; of free runs, the hypothesis is returned unchanged.
+        h: The hypothesis, whose parameters stay as they are.
+        wide: Whether to search the whole range first, and not only near the present intensities.
     """
     if problem.free_run:
         return h
@@ -364,7 +373,7 @@ def choose_process_noise(problem: LikelihoodProblem, h: Hypothesis, wide: bool =
     best, tried = h, list[dict[str, float]]()
 
     def likeliest(trials: list[dict[str, float]]) -> Hypothesis:
-        """The best so far or one with a further process noise; none is run again."""
+        """The likeliest of the best so far and new trials; intensities that were tried are not run again."""
         new = [t for k, t in enumerate(trials) if t not in (*trials[:k], *tried)]
         if not new:
             return best
@@ -377,7 +386,7 @@ def choose_process_noise(problem: LikelihoodProblem, h: Hypothesis, wide: bool =
         evaluated = problem.predictor.of_innovations(
             lambda i, e: problem.evaluated(runs[i], e), parameter_sets, problem.windows.index
         )
-        # Before the first trials nothing was run with the likelihood that counts here.
+        # Before the first trials the likelihood of the best so far is not known for this problem.
         known = [best] if tried else []
         tried.extend(new)
         return max([*known, *evaluated], key=lambda run: run.log_likelihood)
@@ -393,10 +402,17 @@ def choose_process_noise(problem: LikelihoodProblem, h: Hypothesis, wide: bool =
 def refit(
     problem: LikelihoodProblem, hypotheses: Sequence[Hypothesis], wide: bool = False, alternations: int = 3
 ) -> list[Hypothesis]:
-    """Alternate parameters and process noise of each hypothesis until its likelihood converges.
+    """Fit parameters and process noise of each hypothesis in turn until its likelihood converges.
 
-    After so many alternations little is left to gain. What still gains much goes on for `EXTRA_ALTERNATIONS`
-    at most: stopped too early, the right effect may look worse than a wrong one that has converged.
+    Usually little is left to gain after the given number of alternations. A hypothesis that still gains much
+    continues for at most `EXTRA_ALTERNATIONS`: stopped too early, the right effect may look worse than a
+    wrong one that has converged.
+
+    Args:
+        problem: The likelihood.
+        hypotheses: Where the fits start.
+        wide: Whether the first choice of process noise searches the whole range.
+        alternations: Usual number of alternations; 0 to fit the parameters alone.
     """
     if alternations and not problem.free_run:
         problem.make_ahead(hypotheses)
@@ -404,26 +420,26 @@ def refit(
 
 
 def _refitted(problem: LikelihoodProblem, h: Hypothesis, wide: bool, alternations: int) -> Hypothesis:
-    """The same for one hypothesis."""
+    """One hypothesis, refitted as in `refit`."""
     current = _fitted(problem, h)
     for k in range(alternations + EXTRA_ALTERNATIONS if alternations else 0):
         new = _fitted(problem, choose_process_noise(problem, current, wide and k == 0))
         gain = new.log_likelihood - current.log_likelihood
-        # The whitener may lose a little likelihood between alternations; keep the better of the two.
+        # A new whitener may lower the likelihood a little between alternations; the better fit is kept.
         current = new if gain > 0 else current
         if gain < (1.0 if k + 1 < alternations else EXTRA_ALTERNATION_NATS):
             break
     return current
 
 
-# Where friction holds and lets go at other samples, the slopes predict too large a decrease. Most steps need
-# no more damping than this; where it is too little, a few steps are refused until it is enough.
+# Where friction sticks and slips at other samples, the slopes predict too large a decrease. Most steps need
+# no more damping than this; otherwise a few steps are refused until the damping is large enough.
 CORRECTION_RULES = Rules(enough=MIN_DECREASE_NATS, damping=1e-6, increase=30)
 MAX_CORRECTION_STEPS = 10
 
 
 def finer_integration(problem: LikelihoodProblem, h: Hypothesis) -> LikelihoodProblem | None:
-    """The problem with shorter steps; None where `with_finer_steps` has none."""
+    """The likelihood with shorter integration steps; None where `with_finer_steps` has no shorter ones."""
     predictor, s = problem.predictor, problem.supermodel
     solver = with_finer_steps(predictor.solver, s.clean(h.mean_values(s), h.locations).effects)
     if solver is None:
@@ -437,13 +453,13 @@ def correct_discretisation_bias(problem: LikelihoodProblem, h: Hypothesis) -> Hy
 
         x <- x - (J'J)^-1 J'w
 
-    with the slopes `J` of the search's own step and the whitened innovations `w` of `finer_integration`.
-    Friction that builds up within a sample shifts an estimate by several of its standard
-    deviations; where the motion is linear the step is exact and no parameter moves.
+    with the slopes `J` of the integration step of the search and the whitened innovations `w` of
+    `finer_integration`. Friction that builds up within a sample may shift an estimate by several of its
+    standard deviations. Where the motion is linear, the step is exact and no parameter moves.
 
     Args:
-        problem: With the training recordings.
-        h: At its optimum.
+        problem: Likelihood of the training recordings.
+        h: The hypothesis at its optimum.
     """
     seen, fine = problem.seen, finer_integration(problem, h)
     if fine is None:

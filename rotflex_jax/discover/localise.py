@@ -1,4 +1,4 @@
-"""Where the error of a model lies: when, how fast, at which speeds and deflections, after which events."""
+"""Where the error of a model lies: in time, frequency, speed and deflection, and after reversals."""
 
 import dataclasses
 import math
@@ -19,11 +19,11 @@ from rotflex_jax.recording.recording import single
 from rotflex_jax.recording.smoothing import local_polynomial, smoothed
 from rotflex_jax.text.numbers import as_read, percent_of_whole
 
-# Angles are smoothed over this half width before they are differentiated [s].
+# Half width of the window over which signals are smoothed before they are differentiated [s].
 SMOOTHING_SECONDS = 0.03
-# Times after a reversal that are tried [s].
+# Times after a reversal that are tried as conditions [s].
 REVERSAL_SECONDS = (0.02, 0.04, 0.08, 0.12, 0.2, 0.3, 0.5)
-# Least and largest share of the samples that a condition may hold for.
+# A condition is tried if the share of samples for which it holds lies between these two.
 MIN_TIME_SHARE, MAX_TIME_SHARE = 0.03, 0.6
 PROFILE_BINS = 8
 
@@ -37,7 +37,7 @@ class ConditionSet:
         masks: Samples for which each of the K conditions holds.
         phrases: Each condition in words, such as "while the hub turns slower than 20 deg/s".
         bins: Bin of each sample for the profile.
-        edges: Of the bins [unit].
+        edges: Edges of the bins [unit].
         unit: SI unit of the edges.
     """
 
@@ -58,16 +58,17 @@ def half_width(recording: Recording) -> int:
 def missing_acceleration(
     error: Float[np.ndarray, " N"], recording: Recording, starts: Sequence[int] = (), order: int = 2
 ) -> tuple[Float[np.ndarray, " N"], Bool[np.ndarray, " N"]]:
-    """Smoothed acceleration of an error: what the model lacks at that time, not what earlier errors left.
+    """Smoothed acceleration of an error, which shows where the error arises and not where it persists.
 
     Args:
-        error: Of one channel that measures a motion [unit].
-        recording: Gives the sampling.
-        starts: Samples at which the free run started again; a jump there is no physics.
-        order: Of the derivative; 1 for a channel that measures a speed.
+        error: Error of one channel that measures a motion [unit].
+        recording: Recording with this channel; gives the sampling period.
+        starts: Samples at which the free run started again; a jump there is not caused by the physics.
+        order: Order of the derivative: 2 for a channel that measures a position, 1 for a speed.
 
     Returns:
-        Acceleration [unit/s^2], and where it is known; nowhere in a very short recording.
+        Acceleration [unit/s^2, or unit/s for a speed], and the samples where it is known; none in a very
+        short recording.
     """
     half, seen = half_width(recording), np.ones(len(error), bool)
     if not half:
@@ -80,12 +81,12 @@ def missing_acceleration(
 
 
 def derivative_of(channel: str, unit: str, mechanism: Mechanism | None = None) -> int:
-    """Order of the derivative of a position that a channel measures; 2 for a reading of the motor.
+    """Derivative that a channel measures: 0 for a position, 1 for a speed, 2 for a reading of the motor.
 
     Args:
-        channel: Its name.
-        unit: Of the channel; without a mechanism that has it, this tells a speed and a current.
-        mechanism: Says what the channel measures.
+        channel: Name of the channel.
+        unit: Unit of the channel, which decides if the mechanism does not have the channel.
+        mechanism: Defines what the channel measures.
 
     >>> derivative_of("theta", "rad"), derivative_of("gyro", "rad/s"), derivative_of("current", "A")
     (0, 1, 2)
@@ -101,7 +102,7 @@ def motion_channels(units: Mapping[str, str], mechanism: Mechanism | None = None
 
     Args:
         units: Channel -> its unit.
-        mechanism: Says what the channels measure.
+        mechanism: Defines what the channels measure.
     """
     return tuple(c for c, unit in units.items() if derivative_of(c, unit, mechanism) < 2)
 
@@ -112,16 +113,16 @@ def condition_sets(
     noise: Mapping[str, float],
     mechanism: Mechanism | None,
 ) -> tuple[ConditionSet, ...]:
-    """The sets of conditions that the motion of the recording allows; none for a recording at rest.
+    """Sets of conditions on speed, deflection and reversals of the recorded motion; none at rest.
 
-    The first channel that measures a motion is taken for what turns, and another one that measures a position
-    for what deflects; a single position for both.
+    Speed and reversals are taken from the first channel that measures a motion. The deflection is another
+    channel that measures a position; if there is no other, the only position serves for both.
 
     Args:
         recording: Measured outputs.
-        channels: Those of the model.
+        channels: Channels of the model.
         noise: Channel -> standard deviation of the sensor noise.
-        mechanism: Says what the channels measure; by their names if None.
+        mechanism: Defines what the channels measure; if None, their names and units decide.
     """
     half = half_width(recording)
     units = {c: recording.unit(c) for c in channels}
@@ -187,7 +188,7 @@ def _beyond(what: str) -> dict[str, str]:
 
 
 def _sides(kind: str, x: np.ndarray, unit: str, error: float, phrases: dict[str, str]) -> ConditionSet | None:
-    """Small and large values, on either side; None where nothing moves beyond the noise."""
+    """Conditions that a signal is small, large, or on one side of zero; None where it is within the noise."""
     reach = float(np.quantile(np.abs(x), 0.98))
     if reach <= 5 * error or reach == 0.0:
         return None
@@ -208,14 +209,14 @@ def _sides(kind: str, x: np.ndarray, unit: str, error: float, phrases: dict[str,
 
 
 def _reversals(speed: np.ndarray, error: float, Ts: float, what: str) -> ConditionSet | None:
-    """Times after each reversal of the motion; noise about standstill is none."""
+    """Conditions on the time since the last reversal of the motion; noise at standstill is no reversal."""
     threshold = max(4 * error, 0.03 * float(np.sqrt(np.mean(speed**2))))
     clear = np.flatnonzero(np.abs(speed) > threshold)
     signs = np.sign(speed)
     turned = np.flatnonzero(signs[clear][1:] != signs[clear][:-1]) + 1
     if not len(turned):
         return None
-    # The reversal is the last change of sign before the motion is clearly the other way.
+    # A reversal is the last change of sign before the speed is clearly in the other direction.
     changes = np.flatnonzero(signs[1:] != signs[:-1]) + 1
     times = changes[np.searchsorted(changes, clear[turned], side="right") - 1]
     samples = np.arange(len(speed))
@@ -230,7 +231,7 @@ def _reversals(speed: np.ndarray, error: float, Ts: float, what: str) -> Conditi
 
 
 def _informative(conditions: ConditionSet) -> ConditionSet | None:
-    """The set without conditions that hold for too little or too much of the time."""
+    """The set without conditions that hold too rarely or too often; None if no condition is left."""
     shares = conditions.masks.mean(axis=1)
     chosen = (shares >= MIN_TIME_SHARE) & (shares <= MAX_TIME_SHARE)
     if not chosen.any():
@@ -256,7 +257,7 @@ NOISE_DRAWS = 999
 
 
 class ErrorShare(NamedTuple):
-    """A statement, and the share of the error that an even spread would have there."""
+    """A statement on where the error lies, and the share that an evenly spread error would have there."""
 
     where: Where
     expected: float
@@ -270,7 +271,7 @@ class ErrorShare(NamedTuple):
 def relative_entropy(
     share: float | Float[np.ndarray, "..."], expected: float | Float[np.ndarray, "..."]
 ) -> Float[np.ndarray, "..."]:
-    """Divergence of a share above the expected one from it [nat]; 0 for one below.
+    """Divergence of a share s from a smaller expected share p [nat]; 0 where s is no larger than p.
 
     s log(s/p) + (1-s) log((1-s)/(1-p))
 
@@ -285,7 +286,14 @@ def relative_entropy(
 def in_conditions(
     channel: str, energies: Mapping[str, Float[np.ndarray, " N"] | None], conditions: ConditionSet
 ) -> ErrorShare:
-    """The condition of a set that stands out most, its p-value over all circular shifts."""
+    """The condition of a set that stands out most, with its p-value over all circular shifts of the error.
+
+    Args:
+        channel: Channel that has the error.
+        energies: Verb of the statement -> squared error ("lies") or its squared acceleration ("arises", None
+            where it is unknown).
+        conditions: The conditions that are compared.
+    """
     expected = conditions.masks.mean(axis=1)
     spectrum = np.conj(np.fft.rfft(conditions.masks, axis=1))
     N = conditions.masks.shape[1]
@@ -318,16 +326,17 @@ def in_conditions(
 
 
 def in_time(channel: str, error: Float[np.ndarray, " N"], recording: Recording) -> ErrorShare:
-    """The stretch of time that holds more than its share of the error.
+    """The stretch of time in which the error is largest, with its p-value.
 
-    The range of the cumulated deviation from the mean, over the standard deviation that its autocorrelation
-    explains, follows the distribution of Kuiper's statistic where the error stays the same.
+    The test statistic is the range of the cumulative sum of the squared error less its mean, divided by the
+    standard deviation that follows from the autocorrelation. If the size of the error does not change over
+    time, this statistic has the distribution of Kuiper's statistic.
     """
     energy = error**2
     N = len(energy)
     deviation = energy - energy.mean()
     walk = np.concatenate([[0.0], np.cumsum(deviation)])
-    # The lags come from the error itself: a lasting change of its size is no correlation.
+    # The number of lags comes from the error, not its square: a lasting change of size is no correlation.
     lags = correlation_length(error[:, None])
     r = np.fft.irfft(np.abs(np.fft.rfft(deviation, 2 * N)) ** 2)[: lags + 1]
     long_run = float(r[0] + 2 * np.sum((1 - np.arange(1, lags + 1) / (lags + 1)) * r[1:]))
@@ -335,11 +344,12 @@ def in_time(channel: str, error: Float[np.ndarray, " N"], recording: Recording) 
     j = np.arange(1, 100)
     tail = 2 * np.sum((4 * j**2 * v**2 - 1) * np.exp(-2 * j**2 * v**2))
     p_value = float(np.clip(tail, 0.0, 1.0)) if v > 0.4 else 1.0
-    # The error gathers where the walk climbs; round the ends that is two pieces: one is reported.
+    # The error is large where the cumulative sum rises. If that wraps around the ends, there are two
+    # stretches, of which one is reported.
     low, high = int(walk.argmin()), int(walk.argmax())
     if low > high:
         low, high = max(((0, high), (low, N)), key=lambda part: walk[part[1]] - walk[part[0]])
-    # A few samples at an end are no piece of their own.
+    # A few samples at an end do not count as a stretch of their own.
     low, high = (0 if low < N / 100 else low), (N if high > 0.99 * N else high)
     share, expected = float(energy[low:high].sum() / energy.sum()), (high - low) / N
     start, end = (recording.start + recording.Ts * k for k in (low, high))
@@ -358,7 +368,7 @@ def in_time(channel: str, error: Float[np.ndarray, " N"], recording: Recording) 
 
 
 def in_frequency(channel: str, error: Float[np.ndarray, " N"], recording: Recording, unit: str) -> ErrorShare:
-    """The band, of all runs of neighbouring ones, that differs most from white noise."""
+    """The frequency range, of all unions of neighbouring bands, where the error exceeds white noise most."""
     N = len(error)
     power = np.abs(np.fft.rfft(error)) ** 2
     weight = np.full(len(power), 2.0)  # squares of a real and an imaginary part
@@ -422,34 +432,35 @@ def locate(
 
         share of a condition = sum of e^2 over its samples / sum of e^2
 
-    Each condition (such as "within 80 ms after the hub reverses") is measured by the divergence of its
-    share, `s log(s/p) + (1-s) log((1-s)/(1-p))` with `p` the share of the samples, and compared with
-    the same under all circular shifts of the error against the motion, which keep the correlation
-    of either in time. The best condition on a quantity is compared with the best of every shift, which
-    corrects for having tried several; quantities are compared by the rule of Benjamini and Hochberg.
+    Each condition (such as "within 80 ms after the hub reverses") is rated by the divergence
+    `s log(s/p) + (1-s) log((1-s)/(1-p))` between its share `s` of the error and its share `p` of the
+    samples. The divergence is compared with its values under all circular shifts of the error against the
+    motion, which keep the autocorrelation of both. For each quantity, the largest divergence over all
+    conditions is compared with the largest one of every shift, which corrects for the number of conditions.
+    The number of quantities is corrected for by the rule of Benjamini and Hochberg.
 
-    A free run carries an error on long after it was made. Speed, deflection and reversals are
-    therefore also compared with the acceleration of the error, which shows where it *arises*. The error of
-    a current or a duty is not carried on; these channels tell neither speed nor deflection.
-    Frequencies are compared with white sensor noise, time with an error that stays the same.
+    An error of a free run persists long after its cause. Speed, deflection and reversals are therefore also
+    compared with the acceleration of the error, which shows where it *arises*. The error of a current or a
+    duty does not persist, and these channels give neither speed nor deflection. Frequencies are compared
+    with white sensor noise, time with an error of constant size.
 
-    Not for a few correlation lengths of data: there shifts prove nothing, and nothing is found.
+    Do not use it for data of a few correlation lengths: there shifts prove nothing, and nothing is found.
 
     Args:
         recording: What was measured.
         residual: Measured minus simulated outputs (N, C), of windowed free runs for instance.
         channels: Name of each column.
         noise: Standard deviation of the sensor noise by channel, or in the order of `channels`.
-        mechanism: Says which port a channel measures; by its name if None.
-        window_seconds: Length of the windows after which the free run started again [s]; None for
-            one run. The jumps there are no error of the physics.
+        mechanism: Defines which port a channel measures; if None, the name of the channel decides.
+        window_seconds: Length of the windows after which the free run started again [s]; None for one run
+            over the whole recording. Jumps at these starts are left out of the acceleration.
 
     Returns:
-        Significant statements, the most informative first and frequencies last, since no real error is
-        white; one statement that nothing stands out if there is none.
+        Significant statements, those with the largest divergence first. Frequencies come last, since no real
+        error is white. If no statement is significant, one statement that nothing stands out.
 
     Raises:
-        InputError: Shapes that do not fit, or values that are not finite.
+        InputError: If shapes do not fit together, or values are not finite.
 
     Source: Westfall and Young 1993 (largest statistic over several); Lo 1991 (time); Benjamini and
         Hochberg 1995.
@@ -512,25 +523,25 @@ def _numbers(given: Any) -> Float[np.ndarray, "..."]:
 def _acceleration_energy(
     error: np.ndarray, recording: Recording, window_seconds: float | None, order: int
 ) -> np.ndarray | None:
-    """Squared acceleration of an error (N,): where it is made, wherever it is carried to."""
+    """Squared acceleration of an error (N,), which is large where the error arises; None if it is unknown."""
     starts = [] if window_seconds is None else window_starts(recording, window_seconds)[0].tolist()
     acceleration, seen = missing_acceleration(error, recording, starts, order)
     squared = acceleration**2
     if not np.sum(squared[seen]) > 0.0:
         return None
-    # Where it is unknown, the average counts.
+    # Samples where it is unknown get the mean.
     return np.where(seen, squared, squared[seen].mean())
 
 
 def _significant(found: Sequence[ErrorShare]) -> list[ErrorShare]:
-    """Those that remain when the number of comparisons is corrected for (Benjamini and Hochberg)."""
+    """Statements that are significant after correction for their number (Benjamini and Hochberg)."""
     ranked = sorted(found, key=lambda f: f.where.p_value)
     passed = [k for k, f in enumerate(ranked, 1) if f.where.p_value <= SIGNIFICANCE * k / len(ranked)]
     return ranked[: max(passed, default=0)]
 
 
 def _nothing_stands_out(e: np.ndarray, channels: Sequence[str], noise: Mapping[str, float]) -> Where:
-    """What is said where nothing stands out."""
+    """The statement that nothing stands out."""
     rms = dict(zip(channels, np.sqrt(np.mean(e**2, axis=0)).tolist(), strict=True))
     small = all(rms[c] <= 1.3 * noise.get(c, 0.0) for c in channels)
     return Where(

@@ -1,13 +1,13 @@
-"""One step further where a search stops unexplained: two effects at once.
+"""Pairs of effects that are added together where a search of single effects stops unexplained.
 
-Two effects may hide each other: alone, each is refused, since the other one's errors are larger than what it
-explains. The score test says without a run what two candidates would gain together; the best few pairs are
-refitted at both horizons, and validation data decide by the rules of single effects. A pair must pass them
-beside the model as it is and beside each of its members alone.
+Two effects may hide each other: alone, each is refused, since it explains less than the errors that the lack
+of the other one causes. The score test gives, without a run, what two candidates would gain together. The
+best few pairs are refitted at both horizons, and validation data decide by the rules for single effects. A
+pair must pass these rules compared with the current model and with each of its members alone.
 
-The score test is of first order, and its slopes say little of dry friction beside a poor model. So the effect
-that predictions gained most by when it was refitted alone and the one that free runs gained most by are
-refitted together, too: each may have been refused because of the errors that the other one explains.
+The score test is of first order, and its slopes say little about dry friction in a poor model. So one more
+pair is refitted: the effect that, refitted alone, gained most in predictions, and the one that gained most in
+free runs. Each may have been refused because of errors that the other one explains.
 """
 
 import dataclasses
@@ -44,15 +44,15 @@ from rotflex_jax.discover.verdict import NEAR_FLOOR, TORQUE_NATS
 from rotflex_jax.effects import CATALOG
 from rotflex_jax.runtime.xla import on_threads
 
-# Candidates of which pairs are scored, and pairs that are refitted: the best, and those that gain most beyond
-# what their members promise alone.
+# Number of candidates of which pairs are scored; number of pairs that are refitted for their score, and for
+# the gain beyond the scores of their members.
 PAIRED, BEST_PAIRS, SYNERGETIC_PAIRS = 10, 2, 1
 
 Pair = tuple[EffectLocation, EffectLocation]
 
 
 def is_unexplained(horizons: Horizons, current: ValidatedHypothesis) -> bool:
-    """Whether short runs are above the noise, or predictions still ask for a random torque."""
+    """Whether short free runs are above the noise, or process noise still improves predictions."""
     problem = horizons.prediction.problem
     if bool(np.any(best_window_rmse(current) > NEAR_FLOOR * problem.noise)):
         return True
@@ -60,7 +60,7 @@ def is_unexplained(horizons: Horizons, current: ValidatedHypothesis) -> bool:
 
 
 def best_candidates(prediction: ScoreTest, free_run: ScoreTest, most: int) -> list[EffectLocation]:
-    """Candidates with the largest gains to first order, as shares of the best, summed over both horizons."""
+    """Candidates with the largest first-order gains, as shares of the best one, summed over both horizons."""
     share: dict[EffectLocation, float] = {}
     for test in (prediction, free_run):
         gains = {s.location: s.start.expected_gain for s in test.listed}
@@ -71,9 +71,9 @@ def best_candidates(prediction: ScoreTest, free_run: ScoreTest, most: int) -> li
 
 
 def promising_pairs(prediction: ScoreTest, free_run: ScoreTest) -> list[tuple[PairScore, PairScore]]:
-    """Pairs worth a refit with their scores of both horizons, best first.
+    """Pairs worth a refit with their scores at both horizons, best first.
 
-    At one horizon at least, the second effect must be worth its parameters beside the better one.
+    At one horizon at least, the score of a pair must exceed the score of its better member by `TRAIN_NATS`.
     """
     chosen = best_candidates(prediction, free_run, PAIRED)
     tests = [{p.locations: p for p in test.pairs(chosen)} for test in (prediction, free_run)]
@@ -97,18 +97,20 @@ def promising_pairs(prediction: ScoreTest, free_run: ScoreTest) -> list[tuple[Pa
 def best_refitted(
     s: SuperModel, current: ValidatedHypothesis, known: Sequence[ValidatedHypothesis]
 ) -> tuple[PairStart, PairStart] | None:
-    """The effects with the largest gains on validation data, each refitted alone beside a model.
+    """The two effects with the largest gains on validation data when each was added to a model alone.
 
-    They are the best one as a predictor and the best one in free runs. Where these are the same, or laws of
-    the same thing, they are the two with the largest shares of both gains that are not.
+    They are the effect with the largest gain in predictions and the one with the largest gain in free runs.
+    If these are one effect, or laws of the same thing, the effect with the largest sum of both gains (as
+    shares of the largest) is paired with the next one that is neither.
 
     Args:
         s: The super-model.
         current: The model.
-        known: Models that were fitted and validated, those with one effect more among them.
+        known: Models that were fitted and validated, among them models with one effect more.
 
     Returns:
-        Where a refit of both starts, for predictions and for free runs; None where there are no two.
+        Where a refit of both effects starts, for predictions and for free runs; None if there is no such
+        pair.
     """
     effects = s.without_calibrations
     now = effects(current.hypothesis.locations)
@@ -139,13 +141,13 @@ def best_refitted(
 
 
 def _with_models(scored: PairStart, refitted: PairStart) -> PairStart:
-    """The start of a pair that scores put forward, and the models with either effect, as it names these."""
+    """The start of a pair from its score, with the models that have either effect, in the same order."""
     models = dict(zip(refitted.locations, refitted.alone, strict=True))
     return dataclasses.replace(scored, alone=tuple(models[p] for p in scored.locations))
 
 
 def _is_a_simpler_one(pair: Pair, tests: Sequence[dict[Pair, PairScore]]) -> bool:
-    """Whether a pair gains nothing over the one with a simpler effect in the place of a richer one."""
+    """Whether a pair gains nothing over another pair with a simpler effect in the place of a richer one."""
     for rich, other in (pair, pair[::-1]):
         for name in CATALOG[rich.effect].contains:
             simple = EffectLocation(name, rich.port)
@@ -158,9 +160,10 @@ def _is_a_simpler_one(pair: Pair, tests: Sequence[dict[Pair, PairScore]]) -> boo
 def refit_pairs(
     problem: LikelihoodProblem, current: Hypothesis, pairs: Sequence[PairStart]
 ) -> list[Hypothesis]:
-    """The current model with each pair, from the likeliest of several shares of the amplitudes.
+    """The current model with each pair added and refitted, from the likeliest of several starts.
 
-    Both are added to the current model, or one of them to a model that has the other one already.
+    Starts have several shares of the amplitudes. Both effects are added to the current model, or one of them
+    to a model that already has the other one.
     """
     s, starts = problem.supermodel, []
     for pair in pairs:
@@ -179,14 +182,14 @@ def validated_pairs(
     is_plausible: Callable[[Hypothesis, EffectLocation], bool],
     grown: Sequence[Hypothesis] | None = None,
 ) -> dict[Pair, ValidatedHypothesis]:
-    """A model with each pair, refitted and validated at both horizons; what is not plausible is left out.
+    """A model with each pair, refitted and validated at both horizons; implausible fits are left out.
 
     Args:
-        horizons: Training and validation recordings.
-        beside: The model that they are added to.
-        pairs: Where their refits start, for predictions and for free runs.
-        is_plausible: Whether an effect of a hypothesis is physical, of a size that the recordings reach.
-        grown: The models with them, where they were refitted to predictions before.
+        horizons: Training and validation recordings at both horizons.
+        beside: The model to which pairs are added.
+        pairs: Where the refits start, for predictions and for free runs.
+        is_plausible: Whether an effect of a hypothesis is physical, and of a size that the recordings reach.
+        grown: The models with the pairs, if they were refitted to predictions before.
     """
     problem, runs_problem = horizons.prediction.problem, horizons.free_run.problem
     assert beside.free_run
@@ -216,23 +219,24 @@ def pairs_passed_by(
     say: Callable[[str], None],
     known: Sequence[ValidatedHypothesis] = (),
 ) -> tuple[list[ValidatedHypothesis], list[Pair]]:
-    """The best pairs at the start of a search that ended with two effects or more, of which it has not both.
+    """Fit the best pairs of the start of a search that single steps have missed.
 
-    Each step of a search adds the best single effect. Two that explain the recordings only together, while
-    another one imitates a part of both, would be passed by.
+    Each step of a search adds the best single effect. It may miss two effects that explain the recordings
+    only together, if another effect imitates a part of both. Pairs are fitted if the search has found two
+    effects or more, but not both effects of the pair.
 
     Args:
-        horizons: Training and validation recordings.
-        beside: The model at the start.
-        pairs: The best of it.
-        found: The model at the end.
-        is_plausible: Whether an effect of a hypothesis is physical, of a size that the recordings reach.
+        horizons: Training and validation recordings at both horizons.
+        beside: The model at the start of the search.
+        pairs: The best pairs for this model.
+        found: The model at the end of the search.
+        is_plausible: Whether an effect of a hypothesis is physical, and of a size that the recordings reach.
         say: Called with lines of progress.
         known: Models that were fitted before.
 
     Returns:
-        What was fitted and validated at both horizons, and the pairs that validation data do not distinguish
-        from the model found, or prefer.
+        Models that were fitted and validated at both horizons; and pairs that validation data prefer to the
+        model found, or do not distinguish from it.
     """
     s = horizons.prediction.problem.supermodel
     effects = s.without_calibrations(found.hypothesis.locations)
@@ -249,8 +253,8 @@ def pairs_passed_by(
         pair = scores[0].locations
         if not predictions_apart(found, v):
             tried |= validated_pairs(horizons, beside, [scores], is_plausible, [h])
-        # One whose predictions are worse beyond doubt needs no fit to free runs, whatever they say. It has no
-        # probability then: where predictions count little, it would pass for as good as what was found.
+        # If predictions are clearly worse with the pair, it is not fitted to free runs. Then it has no
+        # probability: where predictions count little, it would seem as good as the model found.
         elif all(is_plausible(h, p) for p in pair):
             tried[pair] = v
     _say_gains(tried, found, say)
@@ -261,7 +265,7 @@ def pairs_passed_by(
 def _say_gains(
     tried: dict[Pair, ValidatedHypothesis], over: ValidatedHypothesis, say: Callable[[str], None]
 ) -> None:
-    """A line of progress for each pair: what it gains over a model."""
+    """Report a line of progress for each pair, with its gains over a model."""
     for pair, v in tried.items():
         say(f"  {_named(pair)}: " + describe(v, over).removeprefix("None: "))
 
@@ -271,9 +275,9 @@ class FoundPair:
     """Two effects that are needed together.
 
     Attributes:
-        found: The model with both.
+        found: The model with both effects.
         members: Each effect -> the model without it.
-        rivals: Each effect -> others that are not distinguished from it beside the other member.
+        rivals: Each effect -> effects that are not distinguished from it in a pair with the other member.
     """
 
     found: ValidatedHypothesis
@@ -289,16 +293,17 @@ def find_pair(
     say: Callable[[str], None],
     known: Sequence[ValidatedHypothesis] = (),
 ) -> tuple[FoundPair | None, list[ValidatedHypothesis]]:
-    """The best pair that passes, if there is one, and all that was fitted and validated.
+    """The best pair that passes all tests, or None; and all models that were fitted and validated.
 
     Args:
-        horizons: Training and validation recordings.
+        horizons: Training and validation recordings at both horizons.
         current: The model so far.
         tests: Its score tests of predictions and of free runs.
-        is_plausible: Whether an effect of a hypothesis is physical, of a size that the recordings reach.
+        is_plausible: Whether an effect of a hypothesis is physical, and of a size that the recordings reach.
         say: Called with lines of progress.
-        known: Models that were fitted and validated at both horizons before: the effects with the largest
-            gains are taken from them, and a pair without a member that is among them is not fitted again.
+        known: Models that were fitted and validated at both horizons before. The effects with the largest
+            gains are taken from them, and models with one member of a pair that are among them are not fitted
+            again.
     """
     s = horizons.prediction.problem.supermodel
     pairs: list[tuple[PairStart, PairStart]] = [*promising_pairs(*tests)]
@@ -345,7 +350,7 @@ def _named(pair: Pair) -> str:
 def _without(
     horizons: Horizons, found: ValidatedHypothesis, location: EffectLocation, current: ValidatedHypothesis
 ) -> ValidatedHypothesis:
-    """A model less one effect, refitted and validated at both horizons."""
+    """A model without one effect, refitted and validated at both horizons."""
     assert found.free_run
     at = (
         (horizons.prediction.problem, found.hypothesis),
@@ -356,7 +361,7 @@ def _without(
 
 
 def _rivals(pair: Pair, able: dict[Pair, ValidatedHypothesis]) -> dict[EffectLocation, list[EffectLocation]]:
-    """For each member what takes its place in another admissible pair that is not distinguished."""
+    """For each member, effects that replace it in another admissible pair that is not distinguished."""
     rivals: dict[EffectLocation, list[EffectLocation]] = {p: [] for p in pair}
     for other, v in able.items():
         mine, theirs = set(pair) - set(other), set(other) - set(pair)

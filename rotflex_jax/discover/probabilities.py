@@ -1,8 +1,9 @@
-"""How probable each set of effects is that a search has fitted, and each effect with it.
+"""Probabilities of the sets of effects that a search has fitted, and of each effect.
 
-A set is rated by what it says of recordings that its fit has not seen, half second by half second, as a
-predictor and in free runs. Residuals of half a second belong together, so sums over half seconds are drawn
-again with random weights: what a set gains only in a few moments loses its lead in many of these draws.
+A set is rated by its predictions and free runs of recordings that it was not fitted to, half second by half
+second. Residuals within half a second are correlated, so sums over half seconds are computed with many draws
+of random weights (Bayesian bootstrap). If a set leads only by a few half seconds, it does not lead in many of
+these draws.
 """
 
 import dataclasses
@@ -20,20 +21,20 @@ from rotflex_jax.effects.labels import effect_label
 from rotflex_jax.errors import InputError
 from rotflex_jax.text.numbers import percent_probable
 
-# Draws of weights of the half seconds, and the seed that makes them the same each time.
+# Number of draws of the weights of half seconds, and the seed that makes them reproducible.
 DRAWS, SEED = 2000, 0
-# A sentence names sets down to this probability.
+# Least probability of a set that a sentence names.
 LEAST_NAMED = 0.01
 
 
 @dataclasses.dataclass(frozen=True)
 class FittedSet:
-    """A set of effects that a search has fitted, and what each half second of validation data says for it.
+    """A set of effects that a search has fitted, with the evidence of each half second of validation data.
 
     Attributes:
-        effects: Names, as "coulomb@hub".
-        prediction: Log-likelihood of predictions [nat]; None where it was not fitted to them.
-        free_run: Minus the logarithm of the error of free runs; None where it was not fitted to them.
+        effects: Names, such as "coulomb@hub".
+        prediction: Log-likelihood of predictions [nat]; None if the set was not fitted to predictions.
+        free_run: Minus the logarithm of the error of free runs; None if the set was not fitted to free runs.
     """
 
     effects: frozenset[str]
@@ -42,18 +43,18 @@ class FittedSet:
 
 
 class EvidenceRule(NamedTuple):
-    """How evidence becomes probability; the numbers are calibrated on simulated machines.
+    """Constants by which evidence becomes probability, calibrated on simulated machines.
 
     Attributes:
-        temperature: Nats of predictions that are worth one: innovations are alike from sample to sample. It
-            is larger by as much as what remains exceeds what the verdict allows: predictions then follow the
-            data within a few samples, whatever the model.
-        run_nats: What half a second says whose error in free run is larger by a factor e [nat].
-        prior_nats: How much likelier than its presence the absence of an effect is beforehand [nat].
-        passed_nats: How much likelier the set that has passed all tests of the search is beforehand than one
-            that has not: they ask for more than evidence, such as a gain on the training data too [nat].
-        elsewhere: Probability that the right set is none of those fitted, where the recordings are explained.
-        elsewhere_unexplained: The same where they are far from explained.
+        temperature: Number of nats of predictions that count as one nat, since innovations are correlated
+            from sample to sample. It is multiplied by the misfit of the model that was found: if much
+            remains, predictions follow the data within a few samples, whatever the model.
+        run_nats: Evidence of half a second in which the error of the free run is larger by a factor e [nat].
+        prior_nats: Prior log-odds of the absence of an effect against its presence [nat].
+        passed_nats: Prior log-odds of the set that has passed all tests of the search against any other set
+            [nat]. The tests require more than this evidence, such as a gain on training data.
+        elsewhere: Probability that no set that was fitted is the right one, if recordings are explained.
+        elsewhere_unexplained: Probability of the same if recordings are far from explained.
     """
 
     temperature: float = 5.0
@@ -64,10 +65,10 @@ class EvidenceRule(NamedTuple):
     elsewhere_unexplained: float = 0.17
 
     def none_of_them(self, misfit: float) -> float:
-        """Probability that the right set is none of those fitted.
+        """Probability that no set that was fitted is the right one.
 
         Args:
-            misfit: Of the model that was found, 1 where it explains the recordings.
+            misfit: Misfit of the model that was found, 1 if it explains the recordings.
         """
         return self.elsewhere + (self.elsewhere_unexplained - self.elsewhere) * (1 - 1 / misfit)
 
@@ -76,11 +77,11 @@ RULE = EvidenceRule()
 
 
 class SetProbability(NamedTuple):
-    """One set of effects and how probable it is.
+    """One set of effects and its probability.
 
     Attributes:
-        effects: Names, as "coulomb@hub"; empty for the model as it was given.
-        probability: 0 to 1.
+        effects: Names, such as "coulomb@hub"; empty for the user's model.
+        probability: Probability from 0 to 1.
     """
 
     effects: frozenset[str]
@@ -89,15 +90,16 @@ class SetProbability(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Probabilities:
-    """Probabilities of sets of effects and of effects.
+    """Probabilities of sets of effects and of single effects.
 
     Attributes:
         sets: Sets that were fitted, the most probable one first; with `elsewhere` they sum to one.
-        effects: Name -> probability that it is there, the share of the fitted sets' probability that has it;
-            a right set elsewhere is taken to have it as often.
-        elsewhere: Probability that the right set is none of these.
-        remarks: What the numbers are conditional on, in sentences.
-        evidence: What they were computed from.
+        effects: Name of an effect -> probability that it is present: probability of the fitted sets that have
+            it, divided by the probability of all fitted sets. A right set that was not fitted is assumed to
+            have the effect as often.
+        elsewhere: Probability that no set that was fitted is the right one.
+        remarks: Conditions of these numbers, in sentences.
+        evidence: Evidence from which they were computed.
     """
 
     sets: tuple[SetProbability, ...]
@@ -107,15 +109,16 @@ class Probabilities:
     evidence: tuple[FittedSet, ...] = dataclasses.field(default=(), repr=False, compare=False)
 
     def credible(self, share: float = 0.9) -> tuple[SetProbability, ...]:
-        """The fewest sets that together have this share of the probability of all that were fitted.
+        """The smallest number of sets that together have a share of the probability of all fitted sets.
 
-        Given that the right set is among those that were fitted; `elsewhere` says how likely it is not.
+        The share is conditional on the right set being among the fitted sets; the probability that it is not
+        is `elsewhere`.
 
         Args:
-            share: Above 0, at most 1.
+            share: Share of the probability, above 0 and at most 1.
 
         Raises:
-            InputError: A share that is no probability.
+            InputError: If `share` is no probability.
         """
         share = checks.number(share, "share", above=0, example="0.9")
         if share > 1:
@@ -127,7 +130,7 @@ class Probabilities:
 
     @property
     def sentence(self) -> str:
-        """The most probable set and the next one, in a sentence."""
+        """A sentence that names the most probable sets, at most three."""
         if not self.sets:
             return ""
         named = [s for s in self.sets[:3] if s.probability >= LEAST_NAMED] or [self.sets[0]]
@@ -159,7 +162,7 @@ class Probabilities:
 
 
 def parts(name: str) -> tuple[str, str]:
-    """Effect and port of a name.
+    """Effect and port of a name in a set.
 
     >>> parts("coulomb@hub")
     ('coulomb', 'hub')
@@ -178,28 +181,28 @@ def set_label(effects: frozenset[str]) -> str:
 
 
 def set_labels(effects: frozenset[str]) -> tuple[str, ...]:
-    """The effects of a set in words, one that says so for the model as it was given."""
+    """The effects of a set in words; for the user's model, one phrase that nothing was added."""
     return tuple(effect_label(*parts(n)) for n in sorted(effects)) or ("nothing more",)
 
 
 def set_probabilities(
     fitted: Sequence[FittedSet], *, misfit: float = 1.0, rule: EvidenceRule = RULE
 ) -> Float[np.ndarray, " S"]:
-    r"""Probabilities of fitted sets among each other, with the scatter of the half seconds.
+    r"""Probabilities of fitted sets, given that one of them is right, with the scatter of the half seconds.
 
     .. math::
         p_s = E_w \frac{e^{l_s(w)}}{\sum_r e^{l_r(w)}}, \qquad
         l_s(w) = \frac{1}{m T} \sum_b w_b v_{sb} + \nu \sum_b w_b f_{sb} - \lambda n_s + \rho_s
 
     with blocks of predictions `v` and of free runs `f` over validation recordings, `n` effects, `rho` for the
-    set that passed the tests of the search, and weights `w` of mean one that are uniform over all there are
-    (Bayesian bootstrap).
+    set that passed the tests of the search (0 for others), and weights `w` of mean one with a uniform
+    Dirichlet distribution (Bayesian bootstrap).
 
     Args:
-        fitted: The sets, first the one that passed the tests. A horizon at which a set was not fitted says as
-            much for it as for the first that was fitted at both.
-        misfit: What is left, `Assessment.misfit` m: 1 where the model that was found explains the recordings.
-        rule: Temperature T, nats of free runs nu, prior nats lambda and rho.
+        fitted: The sets, first the set that passed the tests. If a set was not fitted at a horizon, it gets
+            the evidence of the first set that was fitted at both horizons.
+        misfit: `Assessment.misfit` m of the model that was found: 1 if it explains the recordings.
+        rule: Constants: temperature T, nats of free runs nu, prior nats lambda and rho.
 
     Returns:
         A probability for each set; they sum to one.
@@ -213,7 +216,7 @@ def set_probabilities(
     reference = both[0] if both else 0
 
     def resampled(rows: list[np.ndarray | None]) -> np.ndarray:
-        """Sums over half seconds less those of the reference (DRAWS, S)."""
+        """Weighted sums over half seconds less the sums of the reference set (DRAWS, S)."""
         of_reference = rows[reference]
         if of_reference is None or not len(of_reference):
             return np.zeros((DRAWS, len(rows)))
@@ -234,9 +237,9 @@ def probabilities(fitted: Sequence[FittedSet], *, misfit: float, rule: EvidenceR
     """Probabilities of the sets that a search has fitted.
 
     Args:
-        fitted: The sets, the one reported first; of several fits of one set the first counts.
-        misfit: What is left, `Assessment.misfit`: 1 where the model that was found explains the recordings.
-        rule: How evidence becomes probability.
+        fitted: The sets, first the set that is reported; of several fits of one set the first counts.
+        misfit: `Assessment.misfit` of the model that was found: 1 if it explains the recordings.
+        rule: Constants by which evidence becomes probability.
 
     Returns:
         Probabilities.
@@ -269,12 +272,13 @@ def probabilities(fitted: Sequence[FittedSet], *, misfit: float, rule: EvidenceR
     )
 
 
-# Fits of one set whose log-likelihoods differ by no more than this in training are the same fit [nat].
+# Fits of one set count as the same fit if their log-likelihoods in training differ by no more than this
+# [nat].
 AS_LIKELY_NATS = 1.0
 
 
 def set_names(locations: Iterable[EffectLocation]) -> frozenset[str]:
-    """Effects as the names of a set."""
+    """Names of effects, as they stand in a set."""
     return frozenset(f"{p.effect}@{p.port}" for p in locations)
 
 
@@ -285,16 +289,16 @@ def fitted_sets(
     reported: SearchHorizon,
     machine: Sequence[EffectLocation],
 ) -> list[FittedSet]:
-    """Every set once, the first of `at_both` first.
+    """Every fitted set once, beginning with the first of `at_both`.
 
-    Calibrations are in every model of the search. Whether one is a property of the machine was decided
-    apart, and where it is, it belongs to every set.
+    Calibrations are in every model of the search. A separate test has decided which of them belong to the
+    machine; these belong to every set.
 
     Args:
-        horizons: With the training recordings.
-        at_both: Fitted at both horizons, or to predictions alone.
-        at_reported: Fitted at the reported horizon.
-        reported: That one.
+        horizons: Training and validation recordings at both horizons.
+        at_both: Models fitted at both horizons, or to predictions alone.
+        at_reported: Models fitted at the reported horizon.
+        reported: The reported horizon.
         machine: Calibrations that belong to the machine.
     """
     s = horizons.prediction.problem.supermodel
@@ -318,10 +322,11 @@ def fitted_sets(
 
 
 def best_blocks(fits: Sequence[ValidatedHypothesis]) -> Float[np.ndarray, " B"] | None:
-    """What each half second says for the best fit of a set at one horizon; None without any.
+    """Evidence of each half second for the best fit of a set at one horizon; None without a fit.
 
-    Fits that are as likely in training differ on validation data by the minimum in which the search for
-    first states ended, which must not decide between sets.
+    If several fits are equally likely in training, the one with the largest validation likelihood counts.
+    They differ there by the minimum in which the fit of first states ended, which must not decide between
+    sets.
     """
     if not fits:
         return None

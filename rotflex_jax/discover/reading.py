@@ -1,15 +1,15 @@
-"""What a search says of its recordings: whether they may have been read wrongly, and whether they can decide.
+"""Checks of the recordings of a search: whether they were read wrongly, and whether they can decide.
 
-An input may be smooth between its samples. A converter holds each value until the next; a voltage that was
-measured behind a low-pass filter is determined between its samples by the samples. The two differ by half a
-sample of delay. Read wrongly at a low rate, that delay has the phase of friction, and a search may name a
-richer friction than there is.
+An input may be smooth between its samples. A converter holds each value until the next sample. A voltage that
+was measured behind a low-pass filter is band-limited, so its samples determine it between the samples. The
+two differ by a delay of half a sample. At a low sampling rate, a wrong assumption has the phase of friction,
+and a search may find a richer friction than there is.
 
-A channel may have the opposite sign: a deflection measured from the arm to the hub, or a sensor mounted the
-other way round. A fit then ends at values far from those of any machine.
+A channel may have the opposite sign: a deflection measured from the arm to the hub, or a sensor mounted in
+the opposite direction. A fit then ends at values far from those of any machine.
 
-Validation data may hold a channel nearly at rest that moves in the training data, as the end of a step does.
-What acts on that channel has no consequences there, whatever its size.
+In the validation data, a channel that moves in the training data may be nearly at rest, for example at the
+end of a step. Effects on this channel then make no difference, whatever their size.
 """
 
 import dataclasses
@@ -28,16 +28,18 @@ from rotflex_jax.models.model import Model
 from rotflex_jax.recording.quality import ACCEPTABLE
 from rotflex_jax.text.numbers import plain_number, readable
 
-# The other reading is named where it gains this [nat], and so many standard deviations of the block gains.
+# A smooth input is reported if it gains more than this [nat] and this many standard deviations of block
+# gains.
 LEAST_NATS, LEAST_Z = 20.0, 3.0
-# An input of which more samples than this share repeat the one before is held.
+# An input counts as held if more than this share of its samples repeat the sample before.
 MOST_REPEATED = 0.5
 
 
 def held_equivalent(u: Float[np.ndarray, " N"]) -> Float[np.ndarray, " N"]:
-    """Values that act, each held over its sample, as the band-limited signal through the samples does.
+    """Values that, each held over its sample, act as the band-limited signal through the samples.
 
-    That is its value in the middle of each sample, with the amplitude that holding takes restored.
+    These are the values of the signal in the middle of each sampling interval, with a correction of the
+    amplitude that holding reduces.
 
     >>> t = 0.1 * np.arange(200.0)
     >>> bool(np.allclose(held_equivalent(np.sin(t))[50:150], np.sin(t + 0.05)[50:150], atol=1e-3))
@@ -49,13 +51,14 @@ def held_equivalent(u: Float[np.ndarray, " N"]) -> Float[np.ndarray, " N"]:
 
 
 def nats_if_smooth(problem: LikelihoodProblem, h: Hypothesis) -> float:
-    """What a fitted model gains with the input read as smooth, not held [nat]; zero if that is not clear.
+    """Gain of a fitted model in log-likelihood with a smooth input instead of a held one [nat].
 
-    The input is data of the compiled programs, so this costs one refit from where the model is.
+    It is zero if the gain is not clear, or if the input is obviously held. The input is data of the compiled
+    programs, so this takes one refit from the fitted model.
 
     Args:
-        problem: Predictions of recordings.
-        h: Fitted to them with the input held.
+        problem: Likelihood of predictions of recordings.
+        h: Hypothesis fitted to them with the input held.
     """
     data = problem.dataset.data
     if getattr(problem.predictor.solver, "between", "") != "held":
@@ -74,7 +77,7 @@ def nats_if_smooth(problem: LikelihoodProblem, h: Hypothesis) -> float:
 
 
 def smooth_note(nats: float) -> tuple[str, ...]:
-    """That the other reading of the input is better, and how to ask for it; nothing for zero."""
+    """A note that a smooth input is better, with the option for it; no note if the gain is zero."""
     if not nats:
         return ()
     return (
@@ -85,8 +88,8 @@ def smooth_note(nats: float) -> tuple[str, ...]:
     )
 
 
-# The opposite sign of a channel is tried where errors of free runs are more than this share of the channel's
-# deviation within their windows, and named where they become less than the second share of what they were.
+# The opposite sign of a channel is tried if errors of free runs exceed this share of the channel's standard
+# deviation within windows. It is reported if errors then fall below the second share of their former size.
 LEAST_LEFT, MOST_LEFT = 0.5, 0.6
 
 
@@ -95,18 +98,18 @@ def opposite_signs(
 ) -> dict[str, tuple[float, float]]:
     """Channels that the user's model explains much better with the opposite sign.
 
-    Only channels are tried of which the fitted model leaves much. What was measured is data of the compiled
-    programs, so each costs one refit of free runs from the values that were given.
+    Only channels with large errors of the fitted model are tried. Measured outputs are data of the compiled
+    programs, so each channel takes one refit to free runs, from the user's values.
 
     Args:
         model: The user's model.
-        problem: Free runs over the training recordings.
-        h: The model fitted to them.
+        problem: Likelihood of free runs over the training recordings.
+        h: The model fitted to these free runs.
         seconds: Length of the free runs [s].
 
     Returns:
-        Channel -> its root mean square error as it was read, and with the opposite sign. Nothing where runs
-        of the fitted model diverge.
+        Channel -> its root mean square error as it was read, and with the opposite sign. Empty if runs of the
+        fitted model diverge.
     """
     found: dict[str, tuple[float, float]] = {}
     if not np.isfinite(h.log_likelihood):
@@ -130,7 +133,7 @@ def _deviations(problem: LikelihoodProblem) -> Float[np.ndarray, " C"]:
     """Standard deviation of each measured channel within the windows of free runs."""
     parts = []
     for r, recording in enumerate(problem.dataset.recordings):
-        y = problem.dataset.data.y[r, : recording.N]  # what follows fills the array up
+        y = problem.dataset.data.y[r, : recording.N]  # without padding
         parts += [y[samples] - y[samples].mean(axis=0) for _, samples in problem.windows.of(r)]
     return np.concatenate(parts).std(axis=0)
 
@@ -142,7 +145,7 @@ def _with_opposite_sign(
     negated = []
     for r in problem.dataset.recordings:
         sign = np.where(np.array(r.channels) == channel, -1.0, 1.0)
-        # What was accepted of a channel, such as a limit at zero, may be another fault of its negative.
+        # A fault that the user has accepted, such as a limit at zero, may be another fault after negation.
         negated.append(dataclasses.replace(r, y=r.y * sign, accept=ACCEPTABLE))
     length = problem.dataset.data.seen.shape[1]
     dataset = prepare(model, negated, length=length, like=problem.dataset)
@@ -153,7 +156,7 @@ def _with_opposite_sign(
 def sign_note(
     found: dict[str, tuple[float, float]], units: dict[str, str], seconds: float
 ) -> tuple[str, ...]:
-    """That channels may have the opposite sign, in a sentence each.
+    """A sentence on each channel that may have the opposite sign.
 
     Args:
         found: As `opposite_signs` gives them.
@@ -171,7 +174,8 @@ def sign_note(
     return tuple(sentences)
 
 
-# A channel hardly moves in validation data where its deviation is below this share of that in training data.
+# A channel hardly moves in validation data if its standard deviation is below this share of the one in
+# training.
 LEAST_MOTION = 0.1
 
 
@@ -179,8 +183,8 @@ def still_channels(train: LikelihoodProblem, validation: LikelihoodProblem) -> d
     """Channels that hardly move in validation data.
 
     Args:
-        train: Free runs over the training recordings.
-        validation: The same over the validation recordings.
+        train: Likelihood of free runs over the training recordings.
+        validation: Likelihood of free runs over the validation recordings.
 
     Returns:
         Channel -> its standard deviation within windows of training and of validation data, in its unit.
@@ -193,7 +197,7 @@ def still_channels(train: LikelihoodProblem, validation: LikelihoodProblem) -> d
 def still_note(
     found: dict[str, tuple[float, float]], units: dict[str, str], seconds: float
 ) -> tuple[str, ...]:
-    """That channels hardly move in validation data, in a sentence each.
+    """A sentence on each channel that hardly moves in validation data.
 
     Args:
         found: As `still_channels` gives them.
@@ -212,6 +216,6 @@ def still_note(
 
 
 def _shown(value: float, unit: str) -> str:
-    """A value with its unit as people read them."""
+    """A value with its unit, as people read it."""
     number, read = readable(value, unit)
     return f"{plain_number(number)} {read}"

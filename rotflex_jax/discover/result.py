@@ -22,7 +22,7 @@ from rotflex_jax.text.numbers import json_number, json_numbers
 
 
 class ConditionalInterval(NamedTuple):
-    """A parameter of the final model whose intervals at the two horizons exclude each other.
+    """A parameter of the final model whose intervals from predictions and from free runs are disjoint.
 
     Attributes:
         prediction: Its estimate from one-step predictions.
@@ -48,8 +48,8 @@ def excluding(
 
         |a - b| > 1.96 (std_a + std_b)
 
-    Of a complete model both fits are estimates of the same number, whose difference scatters by less than
-    that; of an incomplete one each horizon has its own best number.
+    If the model is complete, both fits estimate the same number, and their difference scatters by less than
+    this limit. If the model is incomplete, each horizon has its own best number.
 
     Args:
         prediction: Estimates of a model fitted to predictions.
@@ -66,7 +66,7 @@ def excluding(
 
 
 def conditional_note(found: Sequence[ConditionalInterval]) -> tuple[str, ...]:
-    """What follows for a reader, as a sentence with the values of each; nothing where all agree."""
+    """A note for the reader with both intervals of each parameter; no note where all intervals agree."""
     if not found:
         return ()
     listed = "; ".join(
@@ -104,25 +104,28 @@ class Stage:
     Attributes:
         model: Fitted model.
         estimates: Parameters with intervals; calibrations (offset, bias) among them.
-        held_out_rmse: Channel -> error of one free run over the validation recordings.
-        held_out_rmse_windows: Channel -> error of free runs that start again every `window_seconds`.
+        held_out_rmse: Channel -> root mean square error of one free run over each validation recording.
+        held_out_rmse_windows: Channel -> root mean square error of free runs over the validation recordings
+            that start again every `window_seconds`.
         simulated: Free run over each validation recording.
-        windowed: The same, started again every `window_seconds`.
-        window_seconds: [s].
-        process_noise: Port -> intensity of the process torque with the largest likelihood [(N m)^2 s]; small
-            where the model is right.
+        windowed: Free run over each validation recording, started again every `window_seconds`.
+        window_seconds: Length of the windows [s].
+        process_noise: Port -> likeliest intensity of the process noise [(N m)^2 s]; small where the model is
+            right.
         process_noise_nats: Log-likelihood per measured value of the training recordings that the process
-            torque gains [nat]; near zero where the model is right.
-        log_likelihood: Of the validation recordings at this horizon [nat].
+            noise gains [nat]; near zero where the model is right.
+        log_likelihood: Log-likelihood of the validation recordings at the horizon `horizon` [nat].
         horizon: What the parameters were fitted to: "prediction", or "free_run" where short free runs over
             the validation recordings are then clearly better.
-        calibrated: The validation errors where each recording has the offsets that its own first
-            `calibrate_seconds` give.
-        test: Errors on test recordings, which were used for no fit and no choice; None without any.
-        test_calibrated: The same with each recording's own offsets.
-        calibrate_seconds: What a recording's own offsets are fitted to [s].
-        of_validation: The model with the phase that a disturbance has in each validation recording; empty
-            without one.
+        calibrated: Validation errors with the offsets of each recording fitted to its first
+            `calibrate_seconds`.
+        test: Errors on test recordings, which were used for no fit and no choice; None without test
+            recordings.
+        test_calibrated: Test errors with the offsets of each recording fitted to its first
+            `calibrate_seconds`.
+        calibrate_seconds: Length of the part of a recording to which its own offsets are fitted [s].
+        of_validation: The model for each validation recording, with the phase of a periodic disturbance
+            there; empty without a disturbance.
     """
 
     model: Model
@@ -143,7 +146,7 @@ class Stage:
     of_validation: tuple[Model, ...] = ()
 
     def model_on(self, i: int) -> Model:
-        """The model of validation recording `i`."""
+        """The model for validation recording `i`."""
         return self.of_validation[i] if self.of_validation else self.model
 
     def errors(self) -> dict[str, Any]:
@@ -164,13 +167,15 @@ class Stage:
 
 
 class KnownRuns(NamedTuple):
-    """The runs that a model was fitted to, and what is known of their offsets.
+    """The runs that a model was fitted to, and whether their offsets were compared with another run.
 
-    An offset of the voltage or a bias of a sensor belongs to a run until another run shows the same.
+    An offset of the voltage or a bias of a sensor counts as a property of its run until another run shows the
+    same value.
 
     Attributes:
-        recordings: What was fitted.
-        compared: Whether offsets of one run were tried on another: those in a model are then the machine's.
+        recordings: The recordings that were fitted.
+        compared: Whether offsets of one run were tested on another run. If so, the offsets that a model keeps
+            are properties of the machine.
     """
 
     recordings: tuple[Recording, ...]
@@ -178,13 +183,17 @@ class KnownRuns(NamedTuple):
 
     @classmethod
     def of(cls, train: Sequence[Recording], validation: Sequence[Recording]) -> "KnownRuns":
-        """Those of training recordings; where these validate each other, `validation` is the same."""
+        """The runs of the training recordings.
+
+        Where training recordings validate each other, `validation` has the same recordings as `train`.
+        """
         return cls(tuple(train), any(not of_one_run(a, b) for a in train for b in validation))
 
     def index(self, recording: Recording) -> int | None:
-        """Which of the recordings is of the same run as another one; None if none is.
+        """Index of the fitted recording that belongs to the same run as a given recording; None if none does.
 
-        Of several parts of the run it is the one that the recording shares most time with, or is nearest to.
+        If several parts of the run were fitted, this is the part that overlaps most in time with the given
+        recording, or that is nearest to it.
         """
         end = recording.start + recording.N * recording.Ts
 
@@ -202,7 +211,7 @@ def _parameters(estimates: Sequence[Estimate]) -> dict[str, Any]:
 
 
 def assess_stages(baseline: Stage, final: Stage, floor: dict[str, float]) -> Assessment:
-    """What the verdict on a final stage rests on.
+    """The assessment of a final stage, on which the verdict rests.
 
     Args:
         baseline: Stage before any effect was added.
@@ -217,24 +226,27 @@ def assess_stages(baseline: Stage, final: Stage, floor: dict[str, float]) -> Ass
 class FinalFit:
     """The final model of a search that ends unexplained, fitted to training and validation recordings.
 
-    The fit is to free runs over windows, from what the first samples of each show; or from fitted first
-    states (`fit.options.first`) where the former errs clearly more on validation data than the search.
+    It is fitted to free runs over windows, each of which starts from the state that its first samples show.
+    If the errors of such a fit on validation data are clearly larger than the errors of the search, the first
+    states are fitted as well (`fit.options.first`).
 
     Attributes:
-        fit: To the training and validation recordings together, with what each has for itself. What belongs
-            to a run has in its `model` and `parameters` the value that runs have in common, or their mean.
-        recordings: What was fitted: training and validation recordings, parts of one run that follow on
-            each other as one (`recording.joined`), since they share the offsets of their run.
-        model: The model of it, with nothing that belongs to one recording.
-        trained: Errors on validation recordings, with their own offsets where these are calibrated, of the
-            structure fitted in the same way to training recordings alone.
-        searched: The same errors of the final model as the search has fitted it.
+        fit: Fit to the training and validation recordings together, with local parameters of each recording.
+            For a local parameter, `fit.model` and `fit.parameters` have the value that the runs have in
+            common, or the mean of the runs.
+        recordings: Training and validation recordings, as they were fitted. Adjoining parts of one run are
+            one recording here (`recording.joined`), since they share the offsets of their run.
+        model: The model of the fit, without what belongs to single recordings.
+        trained: Errors on validation recordings of the same structure, fitted in the same way to the training
+            recordings alone; with the own offsets of each recording where offsets are calibrated.
+        searched: The same errors of the final model with the parameters of the search.
         test: Errors on test recordings, if there are any.
-        test_calibrated: The same with each recording's own offsets.
-        laws: Pairs of an effect that the search has found and the law that stands in its place in this model.
-        friction: Sizes of dry friction that each run has for itself, by full name; `model` has their mean.
-        left_out: Effects, and offsets of the only run, that the search has found and without which free runs
-            are not clearly worse.
+        test_calibrated: Errors on test recordings with the own offsets of each recording.
+        laws: Pairs of an effect that the search has found and the law that replaces it in this model.
+        friction: Full names of the sizes of dry friction that have a value of their own in each run; `model`
+            has the mean of these values.
+        left_out: Effects that the search has found and this model lacks, since free runs are not clearly
+            worse without them. Where all recordings belong to one run, its offsets may be among them.
     """
 
     fit: Fit
@@ -255,7 +267,7 @@ class FinalFit:
         return tuple(self._noted(e) for e in self.fit.parameters if e.name in names)
 
     def _noted(self, e: Estimate) -> Estimate:
-        """An estimate; for a friction that belongs to runs, with the value in each run as a note."""
+        """The estimate; a size of friction that differs between runs has its value in each run as a note."""
         if e.name not in self.friction:
             return e
         of_runs = "mean of runs with " + ", ".join(f"{own.value:.3g}" for own in self.fit.local[e.name])
@@ -286,14 +298,14 @@ class FinalFit:
 
 
 class HorizonGain(NamedTuple):
-    """What an effect gains on validation data at one horizon, with parameters fitted for it.
+    """Gain of an effect on validation data at one horizon, with parameters fitted at this horizon.
 
     Attributes:
-        gain: Log-likelihood of predictions [nat], or for free runs the fall of the logarithm of the error,
-            summed over half seconds.
-        z: How many standard deviations of its scatter over half seconds that is.
-        error_ratio: Error of short free runs with the effect over that without it.
-        training_gain: The same as `gain` on training data.
+        gain: For predictions, increase of the log-likelihood [nat]; for free runs, decrease of the logarithm
+            of the error, summed over half seconds.
+        z: The gain divided by its standard deviation, which is estimated from its scatter over half seconds.
+        error_ratio: Error of short free runs with the effect divided by the error without it.
+        training_gain: The same gain on training data.
     """
 
     gain: float
@@ -306,23 +318,24 @@ class HorizonGain(NamedTuple):
 class Round:
     """One round of the search: an effect that was added.
 
-    Where another effect has taken the place of the one that the round added (a law that fits the data better
-    at the end, or one effect for several), `score`, `prediction` and `free_run` are those of the effect that
-    the round added; so is `held_out_gain_nats` where the stages have parameters of free runs.
+    At the end of the search another effect may replace the effect that the round added: a law that fits the
+    data better, or one effect for several. Then `score`, `prediction` and `free_run` still belong to the
+    effect that the round added. So does `held_out_gain_nats` if the parameters of the stages were fitted to
+    free runs.
 
     Attributes:
         effect: Name of the effect.
         port: Where it acts.
         equivalent: Other (effect, port) that these recordings cannot distinguish from it.
-        parameters: Its own estimates, by short name.
-        stage: The model with it, refitted and evaluated.
+        parameters: Estimates of the parameters of the effect, by short name.
+        stage: The model with the effect, refitted and evaluated.
         score: Penalised score of the candidate [nat].
         held_out_gain_nats: Gain in log-likelihood of the validation recordings [nat].
         sentence: What was found, in words.
-        equation: Its equation.
+        equation: Equation of the effect.
         doubts: Further reasons why the effect may stand in for something else, in words.
-        prediction: What was gained as a predictor when the round added its effect; None for a calibration.
-        free_run: The same in free runs.
+        prediction: Gain of predictions when the round added its effect; None for a calibration.
+        free_run: Gain of free runs when the round added its effect; None for a calibration.
     """
 
     effect: str
@@ -340,14 +353,14 @@ class Round:
 
     @property
     def certain(self) -> str:
-        """What is certain where its law is not, as "dry friction at the hub"; else empty."""
+        """What is certain although the law is not, such as "dry friction at the hub"; otherwise empty."""
         others = {(law_of(effect), port) for effect, port in self.equivalent}
         one_thing = others == {(law_of(self.effect), self.port)}
         return law_phrase(self.effect, self.port) if one_thing and not self.doubts else ""
 
     @property
     def phrase(self) -> str:
-        """The effect in a sentence on the whole; where its law is open, what it is a law of."""
+        """The effect in words; where only its law is open, the phenomenon that the laws describe."""
         return self.certain or effect_phrase(self.effect, self.port)
 
     @property
@@ -402,7 +415,7 @@ class Ranked:
         excited: False where this recording could not have shown an effect of a plausible size.
         unconfounded: Share of its trace in the outputs that the baseline cannot imitate, 0 to 1.
         smallest: Detection limit: factor of a plausible size that would just have been visible.
-        score_free_run: The same score of free runs over some seconds [nat]; None where there was none.
+        score_free_run: Penalised score in free runs over some seconds [nat]; None where it was not computed.
     """
 
     effect: str
@@ -431,14 +444,14 @@ class Where:
 
     Attributes:
         statement: A plain sentence.
-        share: Share of the squared error that it is about.
-        p_value: Chance of such a share if the error were spread evenly.
+        share: Share of the squared error that the statement is about.
+        p_value: Probability of a share as large as this if the error were spread evenly.
         kind: time, frequency, speed, deflection or reversal.
-        channel: Whose error.
+        channel: Channel that has the error.
         edges: Bin edges [unit].
         profile: Share of the squared error in each bin.
         expected: Share of the samples (for frequency: of the noise) in each bin.
-        unit: Of the edges.
+        unit: Unit of the edges.
     """
 
     statement: str
@@ -463,7 +476,10 @@ class Where:
 
 
 def longest_with_a_say(train: Sequence[Recording], validation: Sequence[Recording]) -> Recording:
-    """The longest training or validation recording, first of several; `SearchResult.where` is about it."""
+    """The longest training or validation recording, the first of several equally long ones.
+
+    `SearchResult.where` is about this recording.
+    """
     return max((*train, *validation), key=lambda r: r.N)
 
 
@@ -476,25 +492,26 @@ class SearchResult:
     """What a search found, as data; `Discovery` adds what can be done with it.
 
     Attributes:
-        verdict: On the end state.
+        verdict: Verdict on the final model.
         sentence: The verdict in words.
-        train: Recordings that were fitted.
-        validation: Recordings that the search fitted no model to, but on which it chose between models.
+        train: Training recordings, to which the search fitted its models.
+        validation: Validation recordings: the search fitted no model to them, but chose between models by
+            them.
         baseline: The user's model, fitted.
-        rounds: What was added, in order.
+        rounds: Effects that were added, in order.
         ranking: All candidates in the score test of the baseline, best first.
         where: Where the baseline fails on the longest training or validation recording.
         noise_floor: Channel -> standard deviation of the sensor noise.
         elapsed_s: Time taken [s].
         notes: Remarks for a reader.
-        proposal: Where two effects remain: the standard input that distinguishes them best.
+        proposal: If two effects cannot be distinguished, the standard input that distinguishes them best.
         test: Test recordings, used for no fit and no choice.
         remarks: Parameters of the final model at a bound, or far beyond what the recordings reach.
-        probabilities: Of sets of effects and of effects; None for results made by hand.
+        probabilities: Probabilities of sets of effects and of single effects; None for results made by hand.
         conditional: Parameters whose intervals from predictions and from free runs exclude each other: the
             model is incomplete, and its intervals hold only under it.
-        final_fit: Of a search that ends unexplained, the final model fitted to training and validation
-            recordings.
+        final_fit: The final model fitted to training and validation recordings; None if the search has
+            explained its recordings, or if this fit was refused.
     """
 
     verdict: Verdict
@@ -517,21 +534,21 @@ class SearchResult:
 
     @property
     def model(self) -> Model:
-        """The model after the last round, or that of the final fit where there is one; the one to use.
+        """The model to use: the model of the final fit if there is one, else the model after the last round.
 
-        Errors of the stages are those of `final.model`, which was fitted to the training recordings alone.
+        The stages report errors of `final.model`, which was fitted to the training recordings alone.
         """
         return self.final_fit.model if self.final_fit else self.final.model
 
     def model_of(self, recording: Recording) -> Model:
         """The model to use for a recording: `model` with the offsets that are known of its run.
 
-        A recording of a run that was fitted has the offsets of that run. For one of another run, `model` is
-        without those that a single run has shown.
+        If the recording belongs to a run that was fitted, the model has the offsets of that run. If it
+        belongs to another run, the model lacks offsets that were seen in a single run only. Offsets that the
+        final fit leaves out are in no model.
 
         Args:
-            recording: Any of this machine; a part of a recording keeps its run. An offset that the final fit
-                leaves out is in no model.
+            recording: Any recording of this machine; a part of a recording belongs to the run of the whole.
         """
         runs, m = KnownRuns.of(self.train, self.validation), self.model.mechanism
         fit = self.final_fit.fit if self.final_fit else None
@@ -541,7 +558,7 @@ class SearchResult:
             for location in self.offsets:
                 m = m.without(*location)
         elif k is not None and fit is not None:
-            if runs.compared:  # offsets of a run that others do not share are its own all the same
+            if runs.compared:  # the run keeps its own offsets even if other runs do not share them
                 return fit.model_of(k)
             own = {name: each[k].value for name, each in fit.local.items() if name in m.parameter_names}
             m = m.with_values(own)
@@ -549,7 +566,7 @@ class SearchResult:
 
     @property
     def added(self) -> tuple[tuple[str, str], ...]:
-        """Effects that `model` has and the model as it was given lacks, as (effect, port)."""
+        """Effects of `model` that the user's model lacks, as (effect, port)."""
         before, after = (
             [(e.name, e.at) for e in m.mechanism.effects] for m in (self.baseline.model, self.model)
         )
@@ -577,7 +594,7 @@ class SearchResult:
 
     @property
     def longest_validation(self) -> int:
-        """Number of the longest validation recording, the first of several."""
+        """Index of the longest validation recording, the first of several equally long ones."""
         return max(range(len(self.validation)), key=lambda k: self.validation[k].N)
 
     @property
@@ -588,7 +605,8 @@ class SearchResult:
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON types, schema 1.
 
-        `parameters` are those of the last stage; those of the model to use are in `final_fit`, if any.
+        `parameters` belong to the last stage. If there is a final fit, the parameters of the model to use are
+        in `final_fit`.
         """
         first = self.validation[0]
         return {

@@ -1,10 +1,10 @@
-"""Which effect would explain the innovations best, before any refit.
+"""The score test: how much log-likelihood each candidate would gain, to first order and without a refit.
 
-Every candidate is in the super-model with its amplitude at zero. The slope of the innovations along
-the amplitude, whitened, less its projection on everything the baseline can still move, says how much
-likelihood the effect would gain to first order (Rao's score statistic). Where a small amplitude does
-nothing yet (play that is smaller than what a tooth covers in a moment), the change of the innovations
-from a run at full size takes the place of the slope.
+Every candidate is in the super-model with its amplitude at zero. The slopes of the innovations along the
+amplitudes are whitened, and their projection on everything that the baseline can still change is subtracted.
+They give the log-likelihood that the effect would gain to first order (Rao's score statistic). Some effects
+do nothing at small amplitudes, such as play that is smaller than the motion of a tooth within a sample. For
+these, the change of the innovations in a run at full size replaces the slope.
 """
 
 import dataclasses
@@ -25,27 +25,27 @@ from rotflex_jax.latent.in_time import periodic_torques
 from rotflex_jax.runtime.persistent_jit import make_ahead
 from rotflex_jax.runtime.xla import on_threads
 
-# An effect that can gain this much (chi-square) is found about every other time: both the training and
-# the validation data must have their share of it.
+# An effect with this chi-square is found in about half of all cases: it must show both in the training and in
+# the validation data.
 DETECTABLE_CHI2 = 40.0
-# An effect with a threshold acts at its size: this share of it at most.
+# Largest amplitude of an effect with a threshold, as a multiple of the size at which it was run.
 MAX_THRESHOLD_AMPLITUDE = 1.5
-# A candidate whose scores of both horizons add up to less than this share of the best one's is not refitted.
+# A candidate is not refitted if the sum of its scores of both horizons is below this share of the best sum.
 LEAST_SHARE = 0.25
-# Shapes beside the best one at which a refit may start.
+# Number of shapes, besides the best one, at which a refit may start.
 EXTRA_SHAPES = 2
 
 
 @dataclasses.dataclass(frozen=True)
 class Score:
-    """A candidate's score.
+    """Score of a candidate.
 
     Attributes:
-        start: Where a refit should start, with the log-likelihood gained to first order.
-        nats: The same gain, less half a log N per parameter it needs [nat].
+        start: Start of a refit, with the gain in log-likelihood to first order.
+        nats: This gain less half a log N for each parameter of the candidate [nat].
         excited: Whether an effect of plausible size would have been visible.
-        orthogonal_fraction: Norm of the projected slope over the norm of the slope.
-        detection_limit: Factor of the plausible size that would just have been visible.
+        orthogonal_fraction: Norm of the slope after projection, divided by its norm before.
+        detection_limit: Smallest size that would have been visible, as a factor of the plausible size.
     """
 
     start: CandidateStart
@@ -61,11 +61,11 @@ class Score:
 
 
 def residual_lines(problem: LikelihoodProblem, h: Hypothesis) -> tuple[ErrorLine, ...]:
-    """Lines in the spectrum of the innovations that the input has not, the clearest first.
+    """Lines in the spectrum of the innovations that the input does not have, the clearest first.
 
     Args:
-        problem: Predictions of recordings.
-        h: Fitted to them.
+        problem: Likelihood of predictions of recordings.
+        h: Hypothesis fitted to predictions.
     """
     found: list[tuple[float, ErrorLine]] = []
     data, innovations = problem.dataset.recordings, problem.innovations([h])[0]
@@ -86,12 +86,12 @@ def residual_lines(problem: LikelihoodProblem, h: Hypothesis) -> tuple[ErrorLine
 
 
 def score_test(problem: LikelihoodProblem, h: Hypothesis, lines: Sequence[ErrorLine] = ()) -> "ScoreTest":
-    """The test of all candidates that are not yet in the hypothesis.
+    """The score test of all candidates that are not yet in a hypothesis.
 
     Args:
-        problem: Recordings at one horizon.
-        h: What the candidates are beside.
-        lines: Where a disturbance is tried; none is tried without.
+        problem: Likelihood of the recordings at one horizon.
+        h: The hypothesis to which candidates would be added.
+        lines: Lines at which a periodic disturbance is tried; without lines none is tried.
     """
     s, seen = problem.supermodel, problem.seen
     absent = [c for c in s.candidates.values() if c.location not in h.locations]
@@ -127,7 +127,7 @@ def score_test(problem: LikelihoodProblem, h: Hypothesis, lines: Sequence[ErrorL
 def _changes(
     problem: LikelihoodProblem, h: Hypothesis, e: np.ndarray, candidates: list[Candidate]
 ) -> Iterator[tuple[tuple[EffectLocation, int], np.ndarray]]:
-    """For every shape of a candidate with a threshold, what it changes in the innovations (R, N, C)."""
+    """For every shape of candidates with a threshold, the change of innovations at full size (R, N, C)."""
     s, keys, parameter_sets = problem.supermodel, [], []
     for c in candidates:
         locations = (*h.locations, c.location)
@@ -145,8 +145,8 @@ class _Column(NamedTuple):
     """Whitened slopes along one probe.
 
     Attributes:
-        size: Their norm; not finite where a run diverges.
-        left: What the hypothesis cannot explain of them.
+        size: Norm of the slopes; not finite where a run diverges.
+        left: The slopes after projection: the part that the hypothesis cannot imitate.
     """
 
     size: float
@@ -161,13 +161,14 @@ def _columns(whitened: Float[np.ndarray, "K R N C"], orthogonal: Projection) -> 
 
 @dataclasses.dataclass(frozen=True)
 class _Projected:
-    """The innovations less what the hypothesis can still explain, and the slopes of all candidates.
+    """Innovations and slopes of all candidates, without the part that the hypothesis can still explain.
 
     Attributes:
-        r: Whitened innovations less what the hypothesis can still explain.
+        r: Whitened innovations after projection.
         columns: (location, shape) -> slopes, one per probe.
-        samples: How many values were measured.
-        headroom: Innovations over sensor noise: how much smaller they would be if the model were right.
+        samples: Number of measured values.
+        headroom: Size of the innovations over the sensor noise, at least 1: the factor by which the
+            innovations would be smaller if the model were right.
     """
 
     r: Float[np.ndarray, " M"]
@@ -176,13 +177,13 @@ class _Projected:
     headroom: float
 
     def of(self, location: EffectLocation, shape: int) -> Float[np.ndarray, "k M"] | None:
-        """What is left of the slopes of a shape; None where they are not finite."""
+        """Slopes of a shape after projection; None where they are not finite."""
         found = self.columns[(location, shape)]
         return np.array([c.left for c in found]) if all(np.isfinite(c.size) for c in found) else None
 
 
 def _score(c: Candidate, projected: _Projected) -> Score:
-    """The best shape of a candidate, with starts at the next best ones."""
+    """The score of a candidate at its best shape, with starts at the next best shapes too."""
     shapes = [_score_of_shape(c, shape, projected) for shape in range(len(c.probes))]
     best, *rest = sorted(shapes, key=lambda s: -s.nats)
     others = tuple(s.start.values for s in rest[:EXTRA_SHAPES] if s.start.expected_gain > 0)
@@ -215,7 +216,7 @@ def _score_of_shape(c: Candidate, shape: int, projected: _Projected) -> Score:
 
 
 def _amplitudes(J: np.ndarray, r: np.ndarray, c: Candidate) -> np.ndarray:
-    """Amplitudes that lower |r + J a| most, none of them negative where only positive ones exist."""
+    """Amplitudes a that minimise |r + J a|, none of them negative if the candidate is one-sided."""
     keep = np.linalg.norm(J, axis=0) > 1e-9 * max(float(np.linalg.norm(r)), 1e-300)
     a = np.zeros(J.shape[1])
     while keep.any():
@@ -233,8 +234,8 @@ class PairStart:
     """Where a refit of two candidates starts.
 
     Attributes:
-        starts: Of each.
-        alone: Models with the first and with the second, to which a refit may add the other one.
+        starts: Start of each candidate.
+        alone: Models with the first and with the second candidate, to which a refit may add the other one.
     """
 
     starts: tuple[CandidateStart, CandidateStart]
@@ -248,13 +249,14 @@ class PairStart:
 
 @dataclasses.dataclass(frozen=True)
 class PairScore(PairStart):
-    """What two candidates would gain together.
+    """Score of two candidates together.
 
     Attributes:
-        gain: Log-likelihood gained to first order [nat].
-        nats: The same, less half a log N per parameter they need [nat].
-        more: How much more than the penalised better one of them alone [nat].
-        synergy: How much more than both alone [nat]: what each hides of the other.
+        gain: Gain in log-likelihood to first order [nat].
+        nats: This gain less half a log N for each parameter of the two [nat].
+        more: `nats` less the score of the better candidate alone [nat].
+        synergy: `gain` less the sum of the gains of both candidates alone [nat]: what each hides of the
+            other.
     """
 
     gain: float
@@ -265,12 +267,12 @@ class PairScore(PairStart):
 
 @dataclasses.dataclass(frozen=True)
 class ScoreTest:
-    """Scores of all candidates beside one hypothesis, and what two of them would gain together.
+    """Scores of all candidates for one hypothesis, and of any two of them together.
 
     Attributes:
         listed: Scores, best first.
-        candidates: All that were tested.
-        projected: What the scores were computed from; None without candidates.
+        candidates: Candidates that were tested.
+        projected: Innovations and slopes from which scores are computed; None without candidates.
     """
 
     listed: list[Score]
@@ -282,11 +284,11 @@ class ScoreTest:
 
         .. math:: 2 g = b_2^T G_2^{-1} b_2, \qquad G = J_\perp^T J_\perp, \quad b = J_\perp^T r
 
-        with the rows and columns of the two; no model is run. Of their shapes those that gain most together
-        count. Pairs of which one contains the other are one effect and left out.
+        with the rows and columns of the two candidates; no model is run. Each pair has the shapes that gain
+        most together. If one candidate of a pair contains the other, the pair is one effect and is left out.
 
         Args:
-            locations: Of candidates that were tested.
+            locations: Locations of candidates that were tested.
         """
         if self.projected is None:
             return []
@@ -313,7 +315,7 @@ class ScoreTest:
         b: "list[tuple[_Shape, np.ndarray]]",
         alone: dict[EffectLocation, Score],
     ) -> PairScore:
-        """The shapes of two candidates that gain most together."""
+        """The score of two candidates at the shapes that gain most together."""
         assert self.projected
         price = 0.5 * float(np.log(self.projected.samples))
         best = None
@@ -335,14 +337,14 @@ class ScoreTest:
 
 
 class _Shape(NamedTuple):
-    """A candidate at one of its shapes, with its slopes less what the hypothesis can still explain (k, M)."""
+    """A candidate at one of its shapes, with its slopes after projection (k, M)."""
 
     candidate: Candidate
     shape: int
     columns: Float[np.ndarray, "k M"]
 
     def values(self, amplitudes: Float[np.ndarray, " k"]) -> Float[np.ndarray, " P"]:
-        """Parameter values at these amplitudes of the shape's directions."""
+        """Parameter values of the candidate for amplitudes along the directions of the shape."""
         group = np.array(self.candidate.probes[self.shape], float)
         mean = amplitudes @ group if any(self.candidate.amplitudes) else group[0]
         return np.where(self.candidate.amplitudes, mean, group[0])
@@ -358,20 +360,20 @@ def _shapes(c: Candidate, projected: _Projected) -> list[_Shape]:
 
 
 class _Gram(NamedTuple):
-    """Products of all projected slopes with each other and with the innovations."""
+    """Inner products of all projected slopes with each other and with the innovations."""
 
     G: Float[np.ndarray, "K K"]
     b: Float[np.ndarray, " K"]
 
     def solved(self, shapes: Sequence[tuple[_Shape, np.ndarray]]) -> tuple[np.ndarray, float]:
-        """Amplitudes of some columns that gain most together, and that gain [nat].
+        """Amplitudes of the columns of some shapes that gain most together, and their gain [nat].
 
-        Amplitudes that only positive values have are not negative.
+        Amplitudes of one-sided candidates are not negative.
         """
         rows = np.concatenate([i for _, i in shapes])
         positive = np.concatenate([np.full(len(i), s.candidate.one_sided) for s, i in shapes])
         size = np.sqrt(np.diag(self.G)[rows])
-        # Columns of norm one: their sizes differ by powers of ten.
+        # Columns are scaled to norm one, since their sizes differ by powers of ten.
         keep = size > 1e-9 * max(float(size.max()), 1e-300)
         a = np.zeros(len(rows))
         G = self.G[np.ix_(rows, rows)] / np.outer(np.where(keep, size, 1.0), np.where(keep, size, 1.0))
@@ -388,15 +390,16 @@ class _Gram(NamedTuple):
         most = np.concatenate(
             [np.full(len(i), MAX_THRESHOLD_AMPLITUDE if s.candidate.threshold else np.inf) for s, i in shapes]
         )
-        a[keep] = np.minimum(a[keep], most[keep] * size[keep])  # without slope there is no amplitude
+        a[keep] = np.minimum(a[keep], most[keep] * size[keep])  # columns of norm zero have no amplitude
         return a / np.where(keep, size, 1.0), float(-a @ b - 0.5 * a @ G @ a)
 
 
 def promising_at_both(prediction: list[Score], free_run: list[Score], most: int) -> list[tuple[Score, Score]]:
     """Candidates worth a refit with their scores of predictions and of free runs, best first.
 
-    Where another part of the model is wrong, either horizon may be led astray: what counts is the share of
-    the best score, summed over both, and the best of each is always among them.
+    Where another part of the model is wrong, the scores of either horizon may mislead. So candidates are
+    ordered by their share of the best score, summed over both horizons, and the best one of each horizon is
+    always among them.
     """
     both = (prediction, free_run)
     worth = [promising(listed, len(listed)) for listed in both]
@@ -413,10 +416,11 @@ def promising_at_both(prediction: list[Score], free_run: list[Score], most: int)
 
 
 def promising(listed: list[Score], most: int) -> list[Score]:
-    """Scores worth a refit, best first.
+    """Scores of candidates worth a refit, best first.
 
-    A richer effect that gains nothing to first order over the simpler one it contains (a friction that
-    is the same both ways, say) would only be refitted to the same model.
+    A richer effect that gains nothing to first order over the simpler effect that it contains is left out,
+    since its refit would give the same model. An example is an asymmetric friction that is the same in both
+    directions.
     """
     gains = {s.location: s.start.expected_gain for s in listed}
     worth = []

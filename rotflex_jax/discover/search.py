@@ -70,42 +70,42 @@ def discover(
     resume: str | Path | None = None,
     progress: Progress | None = None,
 ) -> Discovery:
-    """Find the physical effects that a model lacks, and say how sure that is.
+    """Find the physical effects that a model lacks, and how certain each of them is.
 
-    The baseline is fitted as a predictor, together with its process noise, and to free runs of a few seconds;
-    all candidate effects are scored at once by the slopes of its errors at both horizons; the best are
-    refitted at both; likelihood on validation data decides, for one effect or for a set that the recordings
-    cannot distinguish. This is repeated until nothing is gained. At the end an effect is left out where the
-    model is no worse without it.
+    The baseline is fitted to predictions, together with its process noise, and to free runs of a few seconds.
+    The score test rates all candidates at once at both horizons, by the slopes of the errors. The best
+    candidates are refitted at both horizons. Validation data then decide for one effect, or for a set of
+    effects that the recordings cannot distinguish. This is repeated until no candidate passes. At the end, an
+    effect is left out if the model is no worse without it.
 
     Args:
         mechanism: The user's model; its parameter values are the start.
-        train: Recordings to fit.
-        validation: Recordings that decide between models, none of which is fitted to them; at most their own
-            first state and offsets are adapted when likelihoods are compared, and only the first `n_init`
-            samples for the errors reported, and size and phase of a periodic disturbance, which are fitted to
-            the whole of each. They also help to estimate the noise of the sensors, and the
-            model that was chosen is fitted to them once, to see whether its parameters are the same there.
-            Where the search ends unexplained, `Discovery.model` is fitted to them as well. Without any, every
+        train: Training recordings, to which models are fitted.
+        validation: Validation recordings, which decide between models; no model is fitted to them before it
+            is chosen. For the comparison of likelihoods, only first states and offsets are fitted to them.
+            For reported errors, first states come from the first `n_init` samples, and size and phase of a
+            periodic disturbance from the whole recording. They also help to estimate the noise of the
+            sensors. The final model is fitted to them once, to compare its parameters. If the search ends
+            unexplained, `Discovery.model` is fitted to them as well. Without validation recordings, every
             training recording validates what was fitted to the others.
-        test: Test recordings, used for no fit and no choice; the errors on them are reported as well.
-        candidates: (effect class, port) pairs; if None the catalogue's first family, at the places that
-            answer to those of the flexible joint (`mechanism.roles`). Each of the `signals` that all
-            recordings have is tried as a torque at each of these ports.
-        rounds: Most effects to add; two that are added together count as two.
+        test: Test recordings, used for no fit and no choice; errors on them are reported.
+        candidates: (effect class, port) pairs; if None, the effects of the catalogue that a search tries, at
+            the places that correspond to their places on the flexible joint (`mechanism.roles`). Each of the
+            `signals` that all recordings have is tried as a torque at each of these ports.
+        rounds: Largest number of effects to add; two effects that are added together count as two.
         window_seconds: Length of short free runs [s].
-        calibrate_seconds: For the errors reported as calibrated, each validation and test recording has the
-            offsets that its own first seconds give [s]; 0 for none.
-        resume: `NAME.stopped.json` that a stopped search of the same recordings has left: the search goes on
-            after the rounds in it, which count among `rounds`.
+        calibrate_seconds: For errors that are reported as calibrated, offsets are fitted to this length at
+            the beginning of each validation and test recording [s]; 0 to leave these errors out.
+        resume: `NAME.stopped.json` that a stopped search of the same recordings has left. The search
+            continues after the rounds in this file, which count among `rounds`.
         progress: Called with a line of text at each stage.
 
     Returns:
         Discovery.
 
     Raises:
-        InputError: No recording, channels that the model lacks, or one that moves against the model; a file
-            to go on from that another search has left.
+        InputError: If there is no recording, if a recording lacks a channel of the model or moves against the
+            signs of the model, or if another search has left the file to continue from.
     """
     started, say = time.perf_counter(), checks.progress(progress)
     clear_compilation_caches()
@@ -125,7 +125,7 @@ def discover(
     supermodel = horizons.prediction.problem.supermodel
     digest = digest_of_search(model, supermodel, window_seconds, trained, held_back)
     with loaded_ahead(*_kind_of_programs(horizons)):
-        # 2. The baseline, or what a search that was stopped had found.
+        # 2. Fit the baseline, or restore what a stopped search had found.
         if resume is None:
             state = fit_as_it_is(model, horizons, say, digest)
         else:
@@ -134,28 +134,28 @@ def discover(
         while len(state.scores) < rounds:
             # 3. Score all candidates.
             promising = score_candidates(state)
-            # 4. Refit the best and decide; where none is worth it alone, two together may be.
+            # 4. Refit the best candidates and decide; if none passes alone, try two together.
             if add_best(state, promising) or add_dry_friction(state, promising):
                 continue
             if not add_pair(state, rounds):
                 break
-        # 5. Leave out what is not needed, and see whether steps of one effect have passed by a pair.
+        # 5. Leave out what is not needed, and check whether single steps have missed a pair.
         _make_ahead(state, evaluation)
         _simplify(state)
         _check_pairs(state)
-        # 6. Evaluate every nested model, and localise what the baseline leaves.
+        # 6. Evaluate every nested model, and localise the errors of the baseline.
         evaluated = evaluate_models(state, evaluation)
-        # 7. The verdict, and what to record next where it is open.
+        # 7. Conclude with the verdict, and with the next experiment if the verdict is ambiguous.
         return with_proposal(conclude(state, evaluated, started))
 
 
 def _with_signals(
     model: Model, deciding: Sequence[Recording], tested: Sequence[Recording]
 ) -> tuple[Model, tuple[str, ...]]:
-    """The model with the signals that all training and validation recordings have; a note on the others.
+    """The model with the signals that all training and validation recordings have; a note on other signals.
 
     Raises:
-        InputError: A test recording lacks one of them.
+        InputError: If a test recording lacks one of these signals.
     """
     every = dict.fromkeys(name for r in deciding for name in r.signals)
     common = common_signals(deciding)
@@ -173,7 +173,7 @@ def _with_signals(
 
 
 def _kind_of_programs(horizons: Horizons) -> tuple[Any, ...]:
-    """What searches have in common that use the same programs, the effects found apart."""
+    """Key that is equal for searches which use the same programs, apart from the effects found."""
     sets = (horizons.prediction.problem, horizons.prediction.validation.problem)
     shapes = tuple((program_length(p.seen.shape[1]), *p.dataset.data.y.shape[::2]) for p in sets)
     problem = sets[0]
@@ -194,7 +194,7 @@ def _prepare(
     candidates: Iterable[tuple[type[Effect], str]] | None,
     window_seconds: float,
 ) -> Horizons:
-    """Training and validation recordings under one super-model, at both horizons."""
+    """Training and validation recordings with one super-model, at both horizons."""
     m = model.mechanism
     if not m.free_names:
         raise InputError("All parameters are trusted, but discovery fits the model; release one.")
@@ -210,13 +210,15 @@ def _prepare(
     supermodel = build(m, wanted, scales(model, train, dataset.torque_scale))
     _check_constants(m, supermodel, (*train, *held_back))
     ports = tuple(process_noise_ports(m, 1.0))
-    # The super-model has friction contacts at every port, of which few are ever switched on.
+    # Two passes are enough: the super-model has friction contacts at every port, but few are ever switched
+    # on.
     solver = model.solver
     solver = dataclasses.replace(solver, passes=2) if isinstance(solver, Exponential) else solver
     problem = LikelihoodProblem.of(supermodel, solver, dataset, ports)
     if not held_back:
         return Horizons.of(model, problem, None, window_seconds)
-    # One length for both, where that makes no run on training data longer, is compiled for once.
+    # Validation data are padded to the length of training data, unless they are longer: then programs are
+    # compiled once for both.
     length = max(padded_length(train), padded_length(held_back))
     of_validation = prepare(model, held_back, length=length, like=dataset)
     other = LikelihoodProblem.of(supermodel, solver, of_validation, ports)
@@ -224,7 +226,7 @@ def _prepare(
 
 
 def _check_apart(train: Sequence[Recording], held_back: Sequence[Recording]) -> None:
-    """Refuses validation data that are training data too."""
+    """Refuse validation data that are also training data."""
     reason = "a search decides on data that no fit has seen; give another recording, or the two parts of "
     reason += "recording.split(0.7)"
     for k, a in enumerate(train):
@@ -232,7 +234,7 @@ def _check_apart(train: Sequence[Recording], held_back: Sequence[Recording]) -> 
 
 
 def _check_constants(m: Mechanism, s: SuperModel, recordings: Sequence[Recording]) -> None:
-    """Refuses constants of effects that the search may add: it fits these."""
+    """Refuse constants of a recording that belong to effects which the search may add, since it fits them."""
     added = set(s.mechanism.parameter_names) - set(m.parameter_names)
     for recording in recordings:
         if known := sorted(added & set(recording.constants)):
@@ -243,7 +245,7 @@ def _check_constants(m: Mechanism, s: SuperModel, recordings: Sequence[Recording
 
 
 def _make_ahead(state: SearchState, evaluation: Evaluation) -> None:
-    """Have the programs made that the end of a search needs for what was found so far."""
+    """Compile in advance the programs that the end of a search needs for the effects found so far."""
     h = state.at(state.reported, state.current).hypothesis
     if fine := finer_integration(state.reported.problem, h):
         fine.make_ahead([h])
@@ -252,11 +254,15 @@ def _make_ahead(state: SearchState, evaluation: Evaluation) -> None:
 
 
 def _simplify(state: SearchState) -> None:
-    """Leave out what is not needed, assign calibrations, merge effects, correct the discretisation bias."""
+    """Simplify the model that was found, and correct its discretisation bias.
+
+    Needless effects are left out, better laws replace others, calibrations are assigned to the machine or to
+    recordings, and several effects are merged into one where one is as good.
+    """
     state.say(beginning("needed", "checking that each effect is needed"))
     needed, poor = _eliminate(state), is_poor(state.current, state.problem.noise)
     swaps = take_better_laws(state) if poor else ()
-    if swaps:  # beside another law other effects and calibrations may be needless
+    if swaps:  # with another law, other effects and calibrations may be unnecessary
         needed = _eliminate(state)
     final = state.current.hypothesis
     order = state.in_order(final.locations)
@@ -287,7 +293,7 @@ def _simplify(state: SearchState) -> None:
 
 
 def _eliminate(state: SearchState) -> Eliminated:
-    """Leave out what is not needed; the model that is left joins what was tried."""
+    """Leave out what is not needed; the model that is left joins the models that were tried."""
     assert state.current.free_run
     h, runs = state.current.hypothesis, state.current.free_run.hypothesis
     needed = eliminate(state.horizons, h, runs, list(state.scores))
@@ -305,8 +311,8 @@ def _eliminate(state: SearchState) -> Eliminated:
 
 
 def _check_pairs(state: SearchState) -> None:
-    """Fit the best pairs of the start that were not found; they join the sets with probabilities."""
-    if state.start is None or state.validation.folds:  # a fit for each recording, for a check
+    """Fit the best pairs of the start that were not found; they join the sets that have probabilities."""
+    if state.start is None or state.validation.folds:  # with folds, it would take a fit for each recording
         return
     beside, pairs = state.start
     given = state.horizons, beside, pairs, state.current, state.is_plausible, state.say
@@ -321,9 +327,9 @@ def _check_pairs(state: SearchState) -> None:
 
 
 def _left_out(state: SearchState, needed: Eliminated) -> list[ValidatedHypothesis]:
-    """The final model without each effect, on validation data; only those that no round has fitted."""
+    """The final model without each effect in turn, validated; without models that a round has fitted."""
     effects = state.problem.supermodel.without_calibrations
-    if state.validation.folds:  # a fit for each recording, for a comparison that decides nothing
+    if state.validation.folds:  # with folds, it would take a fit for each recording, and it decides nothing
         return []
     known = {effects(v.hypothesis.locations) for v in state.tried}
     unknown = [h for h in needed.without if effects(h.locations) not in known]

@@ -1,4 +1,4 @@
-"""What a search has found so far: the models after each round, at both horizons, and what led to them."""
+"""State of a search: the models after each round, at both horizons, with scores, gains and rivals."""
 
 import dataclasses
 import functools
@@ -46,35 +46,35 @@ Progress = Callable[[str], None]
 
 @dataclasses.dataclass
 class SearchState:
-    """What a search has found so far.
+    """State of a search: everything that it has found so far.
 
     Attributes:
         model: The user's model.
-        horizons: The training and validation recordings as predictions and as free runs.
+        horizons: Training and validation recordings at both horizons.
         say: Called with lines of progress.
         current: The best model so far, fitted at both horizons.
-        ranking: Scores of all candidates beside the baseline, of predictions and of free runs.
-        scores: Effects that were added, in order -> the penalised score that put them forward [nat].
-        rivals: Effects that were added -> those that were not distinguished from them.
+        ranking: Scores of all candidates for the baseline, in predictions and in free runs.
+        scores: Effects that were added, in order -> penalised score for which they were refitted [nat].
+        rivals: Effects that were added -> effects that were not distinguished from them.
         passed: Baseline and the models after each round.
-        worth: What the last test of need gave each effect and calibration [nat].
+        worth: Effects and calibrations -> gain in log-likelihood by them in the last elimination [nat].
         order: Effects and calibrations of the machine, in order.
         own: Calibrations that belong to the training recordings alone.
         notes: Remarks for a reader.
-        gains: Effects that were added -> what they gained at both horizons.
-        final: The model that is reported, with the parameters of `reported`.
-        tried: Models fitted and validated at both horizons on the way.
-        alternatives: Models fitted and validated at the reported horizon beside the final one.
-        merged: The final model with one effect in the place of several, where it has one.
-        in_place_of: That effect -> the one of several whose place in the order it took.
+        gains: Effects that were added -> their gains in predictions and in free runs.
+        final: The model that is reported, with parameters of the horizon `reported`.
+        tried: Models that were fitted and validated at both horizons.
+        alternatives: Other models that were fitted and validated at the reported horizon.
+        merged: The final model with one effect that replaces several; None without such an effect.
+        in_place_of: The effect that replaces several -> the replaced effect whose place in the order it has.
         machine: Calibrations that belong to the machine.
-        start: The model beside which all candidates were scored first, and the best pairs of these.
-        tests: Score tests of the model of `tested`, of predictions and of free runs.
-        tested: The model whose score tests were made last.
-        nominal: The user's model with the values that it has, where the fit has moved far away from these.
-        resumed: After how many rounds of a search that was stopped this one went on.
-        reading_notes: That recordings may have been read wrongly or cannot decide, in sentences.
-        digest: Of all that the models depend on.
+        start: The model for which candidates were scored first, and its best pairs of candidates.
+        tests: Score tests of the model `tested`, in predictions and in free runs.
+        tested: The model of the last score tests.
+        nominal: The user's model with its given values; None unless the fit has moved far away from them.
+        resumed: Number of rounds of a stopped search after which this search continued.
+        reading_notes: Notes that recordings may have been read wrongly, or cannot decide.
+        digest: Digest of everything that the models depend on.
     """
 
     model: Model
@@ -108,21 +108,21 @@ class SearchState:
 
     @property
     def origin(self) -> ValidatedHypothesis:
-        """The model beside which slopes say what a candidate would do: the current one, or the nominal one.
+        """The model for which candidates are scored: the current one, or the nominal one in the first round.
 
-        Beside a baseline that hardly moves no candidate has a slope; beside the given values it has.
+        In a baseline that hardly moves, no candidate has a slope. With the given values candidates have one.
         """
         return self.nominal if self.nominal and not self.scores else self.current
 
     @functools.cached_property
     def reach(self) -> Reach:
-        """How far the signals of the training recordings go."""
+        """Ranges of the signals of the training recordings."""
         return Reach.of(self.model, self.problem.dataset.recordings)
 
     def is_plausible(self, h: Hypothesis, location: EffectLocation) -> bool:
         """Whether the parameters of an effect are physical, and of sizes that the recordings reach.
 
-        A sensor of which readings as large as the recorded ones belong to no true value is not physical.
+        A sensor is not physical if readings as large as the recorded ones correspond to no true value.
         """
         s = self.problem.supermodel
         if not is_physical(s, h, location):
@@ -135,7 +135,7 @@ class SearchState:
 
     @property
     def problem(self) -> LikelihoodProblem:
-        """The likelihood of predictions of the training recordings."""
+        """Likelihood of predictions of the training recordings."""
         return self.horizons.prediction.problem
 
     @property
@@ -145,7 +145,7 @@ class SearchState:
 
     @property
     def noise_floor(self) -> dict[str, float]:
-        """Channel -> standard deviation of what the sensor adds by itself."""
+        """Channel -> standard deviation of the sensor noise."""
         return dict(zip(self.model.mechanism.channels, self.problem.noise.tolist(), strict=True))
 
     @property
@@ -156,10 +156,10 @@ class SearchState:
 
     @property
     def reported(self) -> SearchHorizon:
-        """The horizon whose parameters a user gets: that of predictions, unless free runs are clearly better.
+        """The horizon whose parameters a user gets: predictions, unless fits to free runs are clearly better.
 
-        Where the model is complete both give the same within their scatter, and predictions have the narrower
-        intervals.
+        If the model is complete, both horizons give the same parameters within their scatter, and predictions
+        give the narrower intervals.
         """
         runs = self.current.free_run
         if runs is None or not runs_clearly_better(runs.window_rmse, self.current.window_rmse):
@@ -167,11 +167,11 @@ class SearchState:
         return self.horizons.free_run
 
     def at(self, horizon: SearchHorizon, found: ValidatedHypothesis) -> ValidatedHypothesis:
-        """A validated structure with the parameters of one horizon."""
+        """A validated model with the parameters of one horizon."""
         return found.free_run if horizon is self.horizons.free_run and found.free_run else found
 
     def reached(self, label: str, added: Sequence[AddedEffect] = ()) -> None:
-        """Report the error of the current model, after effects were added."""
+        """Report the error of the current model, with the effects that were added last."""
         channels, errors = self.model.mechanism.channels, best_window_rmse(self.current)
         line = milestone(label, channels, self.units, errors, self.problem.noise)
         if (runs := self.current.free_run) is not None:
@@ -180,7 +180,7 @@ class SearchState:
         self.say(line)
 
     def score_tests(self, beside: ValidatedHypothesis) -> tuple[ScoreTest, ScoreTest]:
-        """Score tests of predictions and of free runs beside a model; those made last are kept."""
+        """Score tests of all candidates for a model, in predictions and in free runs; the last are kept."""
         assert beside.free_run
         if self.tests is None or self.tested is not beside.hypothesis:
             self.tested = beside.hypothesis
@@ -192,7 +192,7 @@ class SearchState:
         return self.tests
 
     def rank(self, beside: ValidatedHypothesis) -> tuple[list[Score], list[Score]]:
-        """Scores of all candidates beside a model, of predictions and of free runs; the first are kept."""
+        """Scores of all candidates for a model, in predictions and in free runs; the first are kept."""
         listed, runs = (test.listed for test in self.score_tests(beside))
         if not self.ranking:
             by_runs = {x.location: x.nats for x in runs}
@@ -201,7 +201,7 @@ class SearchState:
         return listed, runs
 
     def add(self, found: ValidatedHypothesis, added: Sequence[AddedEffect]) -> None:
-        """One model more, with the effects that led to it."""
+        """Take a model with further effects as the current one, with the data of the effects added."""
         for effect in added:
             self.scores[effect.location] = effect.score
             self.rivals[effect.location] = list(effect.rivals)
@@ -211,10 +211,10 @@ class SearchState:
         self.reached("+ " + " + ".join(str(effect.location) for effect in added), added)
 
     def in_order(self, on: Collection[EffectLocation]) -> list[EffectLocation]:
-        """Those of some effects that were added, in order.
+        """The effects, among those that are on, that the search has added, in order.
 
-        A law stands where an earlier one of the same thing was added that is off: more of what was already
-        found is no later discovery.
+        If an earlier law of the same thing was added and is now off, a law takes the place of this earlier
+        law in the order: it describes what was found then.
         """
         added, other_laws = list(self.scores), self.problem.supermodel.other_laws
 
@@ -225,10 +225,12 @@ class SearchState:
         return sorted((p for p in added if p in on), key=place)
 
     def hand_over(self, left_out: EffectLocation, h: Hypothesis) -> None:
-        """Give what an effect has gained to the law that has its size now, if that was more, and its rivals.
+        """Hand over score, gains and rivals of an effect that was left out to the law that now has its size.
+
+        Score and gains are handed over only if the effect had gained more than the law.
 
         Args:
-            left_out: The effect.
+            left_out: The effect that was left out.
             h: The model without it.
         """
         law = law_with_its_size(h.locations, left_out)
@@ -245,7 +247,7 @@ class SearchState:
         self.rivals[law] = [p for p in rivals if p not in (law, left_out) and p not in h.locations]
 
     def replace(self, old: EffectLocation, found: ValidatedHypothesis) -> None:
-        """Put another law in the place of an effect that was added, whose score and gains remain."""
+        """Replace an effect that was added by another law, which gets its score and gains."""
         new = found.location
         assert new
         # The new one may have been added before, and left out again.
@@ -257,7 +259,7 @@ class SearchState:
 
 
 def fit_as_it_is(model: Model, horizons: Horizons, say: Progress, digest: str) -> SearchState:
-    """The user's model, fitted and validated."""
+    """The state at the start of a search: the user's model, fitted and validated."""
     say(beginning("baseline", "fitting the model as it is"))
     h = fit_baseline(horizons.prediction.problem)
     current = horizons.validated(h, fit_free_run_baseline(horizons.free_run.problem, h))
@@ -268,7 +270,7 @@ def fit_as_it_is(model: Model, horizons: Horizons, say: Progress, digest: str) -
 
 
 def _check_baseline(state: SearchState) -> None:
-    """Whether the baseline asks for another reading of the data, and whether its fit has gone far away."""
+    """Check by the baseline how recordings were read, and whether its fit has moved far from given values."""
     notes = smooth_note(nats_if_smooth(state.problem, state.current.hypothesis))
     if runs := state.current.free_run:
         problem, seconds = state.horizons.free_run.problem, state.validation.window_seconds
@@ -284,7 +286,7 @@ def _check_baseline(state: SearchState) -> None:
 
 
 def _still_channels(state: SearchState) -> tuple[str, ...]:
-    """Which channels hardly move in the validation data, in a sentence each."""
+    """A sentence on each channel that hardly moves in the validation data."""
     at = state.horizons.free_run
     if at.validation.folds:  # the validation recordings are those of training
         return ()
@@ -293,10 +295,10 @@ def _still_channels(state: SearchState) -> tuple[str, ...]:
 
 
 def as_it_was(model: Model, horizons: Horizons, say: Progress, digest: str, path: str | Path) -> SearchState:
-    """What a search that was stopped had found, validated again."""
+    """The state of a stopped search, read from its file and validated again."""
     stages = read_stages(path, digest)
     say(f"going on after {len(stages) - 1} finished rounds")
-    # All of them before any is reported: what is reported is what a file of rounds so far keeps.
+    # All stages are restored before any is reported, since reported stages go into the new file of rounds.
     found: list[ValidatedHypothesis] = []
     for stage in stages:
         try:

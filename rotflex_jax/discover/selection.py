@@ -1,16 +1,16 @@
-"""The likelihood of validation data decides, and it may decide for a set of effects.
+"""Rules by which validation data choose an effect, or a set of effects that cannot be distinguished.
 
 Two candidates are reported together unless log-likelihoods of all recordings differ by two standard
-deviations of their differences over half-second blocks, or errors of short free runs by a tenth; far from the
-noise, those that gain nearly the same are reported together too. A richer effect must beat the simpler one
-that it contains on validation and on training data, by two standard deviations of all blocks and with free
-runs that are no worse; or free runs of both must prefer it by 2.5 standard deviations, with errors that are
-smaller by a tenth.
+deviations of their differences over half-second blocks, or errors of short free runs by a tenth. Far from the
+noise, candidates with nearly the same gain are reported together too. A richer effect must be better than the
+simpler effect that it contains in one of two ways: on validation and on training data, by two standard
+deviations of all blocks, with free runs that are no worse; or in free runs over validation and over training
+data, by 2.5 standard deviations, with errors that are smaller by a tenth.
 
-Every candidate is compared at two horizons, each with parameters fitted for it: as a predictor and in short
-free runs. Where another part of the model is wrong, the likeliest predictor follows the data within a few
-samples, and its parameters are no good for a free run; a free run alone has less power where the model is
-nearly right. So both propose, and what only free runs want counts if they want it strongly.
+Every candidate is compared at two horizons, with parameters fitted at each: predictions and short free runs.
+Where another part of the model is wrong, the likeliest predictor follows the data within a few samples, and
+its parameters are of no use for a free run. Where the model is nearly right, free runs have less power. So
+both horizons count, and a preference of free runs alone counts if it is strong.
 """
 
 import dataclasses
@@ -26,34 +26,37 @@ from rotflex_jax.discover.validation import ValidatedHypothesis, ValidationSet, 
 from rotflex_jax.effects.base import DRY_FRICTION
 from rotflex_jax.effects.labels import law_of
 
-# An effect must gain this on validation data [nat], beyond this many standard deviations of the block gains,
-# and this on the training data after half a log N per parameter, beyond as many standard deviations.
+# Least gain of an effect on validation data [nat], and least number of standard deviations of the block gains
+# there; least gain on training data [nat] beyond half a log N per parameter, and least number of standard
+# deviations there.
 HELD_OUT_NATS, HELD_OUT_Z, TRAIN_NATS, TRAIN_Z = 5.0, 1.5, 8.0, 2.0
-# Mean log error of free runs over short windows: near the sensor noise it may rise by no more than the
-# first, elsewhere it must fall by the second.
+# Change of the mean log error of free runs over short windows: near the sensor noise the error may rise by no
+# more than the first, elsewhere it must fall by at least the second.
 WINDOWS_WORSE, WINDOWS_BETTER = 0.02, 0.01
-# Two effects are distinguished by this many standard deviations of their paired block differences, or by free
-# runs over short windows whose errors differ by more than this (mean log ratio).
+# Two effects are distinguished if their paired block differences exceed this many standard deviations, or if
+# errors of free runs over short windows differ by more than this (mean log ratio).
 SEPARATE_Z, WINDOWS_APART = 2.0, 0.1
-# Where the winner leaves errors far from the noise, likelihood distinguishes only what gains this share less:
-# what is missing besides suits one of two that do nearly the same better by as much.
+# If the winner leaves errors far above the noise, a rival is distinguished by likelihood only if its gain is
+# smaller by this share. Whatever else the model lacks may cause a smaller difference between two effects that
+# do nearly the same.
 GAIN_APART = 0.1
-# What predictions do not want, free runs must want by so many standard deviations of their block gains, on
-# validation and on training data, with an error that falls by so much (mean log ratio).
+# An effect that predictions do not prefer must be preferred by free runs: by this many standard deviations of
+# the block gains, on validation and on training data, and with errors smaller by this (mean log ratio).
 FREE_RUN_Z, FREE_RUN_BETTER = 2.5, 0.1
-# What predictions want by so many standard deviations, on validation and on training data, need not show in
-# free runs whose error something else makes, if these get no worse.
+# An effect that predictions prefer by this many standard deviations, on validation and on training data, need
+# not improve free runs that are dominated by another error, if it does not make them worse.
 PREDICTION_Z = 3.5
-# Free runs of a poor model exclude a rival whose errors are larger by this (mean log ratio): its runs then
-# differ by as much as the errors that are left, if the two are independent.
+# Free runs of a poor model exclude a rival whose errors are larger by this (mean log ratio). If the
+# difference between the runs is independent of the errors that are left, it is then as large as they are.
 LAWS_APART = 0.5 * float(np.log(2.0))
-# Candidates in whose place a winner may stand: so many at most, each with so much of the best score of its
-# round (shares of both horizons added up), of which no more than the last share is left beside the winner.
+# Candidates in whose place a winner may stand: their largest number, the least score of each as a share of
+# the best score of the round (shares of both horizons added), and the largest share of its score that is left
+# beside the winner.
 REPLACED, REPLACED_SHARE, REPLACED_LEFT = 2, 0.25, 0.1
 
 
 def paired_gain(a: Float[np.ndarray, " B"], b: Float[np.ndarray, " B"]) -> tuple[float, float]:
-    """By how many nats blocks `a` exceed blocks `b`, and how many standard deviations that is."""
+    """Sum of the differences of blocks `a` and `b` [nat], and this sum over its standard deviation."""
     d = a - b
     spread = float(np.std(d, ddof=1) * np.sqrt(len(d))) if len(d) > 1 else np.inf
     return float(d.sum()), float(d.sum()) / max(spread, 1e-12)
@@ -62,7 +65,7 @@ def paired_gain(a: Float[np.ndarray, " B"], b: Float[np.ndarray, " B"]) -> tuple
 def horizon_gains(
     candidate: ValidatedHypothesis, current: ValidatedHypothesis
 ) -> tuple[HorizonGain, HorizonGain | None]:
-    """What a candidate gains on validation data, as a predictor and in free runs."""
+    """Gains of a candidate on validation data, in predictions and in free runs."""
     nats, z = paired_gain(candidate.blocks, current.blocks)
     ratio = float(np.exp(_log_error_ratio(candidate, current)))
     prediction = HorizonGain(nats, z, ratio, _training_gain(candidate, current)[0])
@@ -75,12 +78,12 @@ def horizon_gains(
 
 
 def helps(gain: HorizonGain) -> bool:
-    """Whether a gain at one horizon is there beyond doubt."""
+    """Whether a gain at one horizon is positive by more than 1.5 standard deviations."""
     return gain.z > HELD_OUT_Z and gain.gain > 0
 
 
 def describe(candidate: ValidatedHypothesis, current: ValidatedHypothesis) -> str:
-    """One line: what a candidate gained."""
+    """The gains of a candidate, in one line of progress."""
     nats, z = paired_gain(candidate.blocks, current.blocks)
     train, train_z = _training_gain(candidate, current)
     ratio = float(np.exp(_log_error_ratio(candidate, current)))
@@ -134,19 +137,19 @@ def admissible(
     measured: float,
     noise: Float[np.ndarray, " C"],
 ) -> bool:
-    """Whether what a candidate adds is there beyond doubt.
+    """Whether a candidate passes the tests of one round on training and validation data.
 
     Args:
-        candidate: The richer hypothesis.
-        current: Without what it adds.
-        measured: How many values of training recordings were measured.
+        candidate: The hypothesis with the candidate.
+        current: The hypothesis without it.
+        measured: Number of measured values in the training recordings.
         noise: Standard deviation of the sensor noise of each channel.
     """
     nats, z = paired_gain(candidate.blocks, current.blocks)
     train, train_z = _training_gain(candidate, current)
     needed = needed_gain(candidate.parameter_count, measured)
-    # Likelihood is about the next samples, a user's free runs are about many: both must agree. Far from the
-    # sensor noise, an effect that leaves free runs as they were is flexibility, not a discovery.
+    # The likelihood concerns the next samples, but a user wants free runs: both must agree. Far from the
+    # sensor noise, an effect that does not improve free runs is additional flexibility and no discovery.
     far = is_poor(current, noise)
     limit = -WINDOWS_BETTER if far else WINDOWS_WORSE
     enough = nats > HELD_OUT_NATS and z > HELD_OUT_Z and train > needed and train_z > TRAIN_Z
@@ -163,12 +166,12 @@ def admissible(
 
 
 def is_poor(t: ValidatedHypothesis, noise: Float[np.ndarray, " C"]) -> bool:
-    """Whether a model leaves errors far above the noise: what it lacks has a share in every comparison."""
+    """Whether errors of free runs exceed twice the noise, so that what the model lacks biases comparisons."""
     return bool(np.any(best_window_rmse(t) > 2 * noise))
 
 
 def best_window_rmse(t: ValidatedHypothesis) -> Float[np.ndarray, " C"]:
-    """Errors of short free runs with the parameters, of predictions or of free runs, that suit them best."""
+    """Errors of short free runs, with the better of the parameters fitted to predictions and to free runs."""
     if t.free_run is None or runs_clearly_better(t.window_rmse, t.free_run.window_rmse):
         return t.window_rmse
     return t.free_run.window_rmse
@@ -177,9 +180,9 @@ def best_window_rmse(t: ValidatedHypothesis) -> Float[np.ndarray, " C"]:
 def shares_at_each(
     candidates: Sequence[ValidatedHypothesis], current: ValidatedHypothesis
 ) -> Float[np.ndarray, "2 K"]:
-    """What each candidate gains on validation data as a share of the most, as a predictor and in free runs.
+    """Gain of each candidate on validation data as a share of the largest, in predictions and in free runs.
 
-    Zero where it gains nothing, and for free runs where one of the models has none.
+    The share is zero where a candidate gains nothing. It is zero for free runs if one of the models has none.
     """
     shares = np.zeros((2, len(candidates)))
     for row, at in zip(shares, (lambda t: t, lambda t: t.free_run), strict=True):
@@ -192,12 +195,12 @@ def shares_at_each(
 def shares_of_gain(
     candidates: Sequence[ValidatedHypothesis], current: ValidatedHypothesis
 ) -> Float[np.ndarray, " K"]:
-    """What each candidate gains on validation data as a share of the most, summed over the horizons."""
+    """Gain of each candidate on validation data as a share of the largest, summed over both horizons."""
     return shares_at_each(candidates, current).sum(axis=0)
 
 
 def likelier_of_each(candidates: Sequence[ValidatedHypothesis]) -> list[ValidatedHypothesis]:
-    """Of each effect, at each horizon, the fit that is likelier on the training recordings."""
+    """For each effect and at each horizon, the likeliest fit on the training recordings."""
 
     def better(a: ValidatedHypothesis, b: ValidatedHypothesis) -> ValidatedHypothesis:
         return max(a, b, key=lambda v: v.hypothesis.log_likelihood)
@@ -216,12 +219,12 @@ def choose(
     measured: float,
     noise: Float[np.ndarray, " C"],
 ) -> tuple[ValidatedHypothesis | None, list[ValidatedHypothesis]]:
-    """The best admissible candidate and those not distinguished from it; arguments as in `admissible`.
+    """The best admissible candidate, and the candidates that are not distinguished from it.
 
-    Of admissible ones that are like the best (`_alike`), dry friction is chosen first, then what has
-    the fewest parameters.
-    A rival need not pass every test that the winner passed: where the effect is small, which of the two
-    passes is chance. It is enough that it gains something and that nothing distinguishes it from the winner.
+    Among admissible candidates that are like the best (`_alike`), dry friction is chosen first, then the
+    candidate with the fewest parameters. A rival need not pass every test that the winner passed: where the
+    effect is small, chance decides which of the two passes. It is enough that the rival gains something and
+    that nothing distinguishes it from the winner. Arguments are as in `admissible`.
     """
     able = [t for t in candidates if admissible(t, current, measured, noise)]
     if not able:
@@ -230,14 +233,14 @@ def choose(
     winner = max(able, key=lambda t: shares[t.location])
 
     def simplest(t: ValidatedHypothesis) -> ValidatedHypothesis:
-        """An effect, or one that it contains and is not clearly better than."""
+        """The best effect that `t` contains and is not clearly better than; `t` itself without any."""
         simpler = [x for x in able if _contained(x, t) and not _clearly_better(t, x, current)]
         return max(simpler, key=lambda x: shares[x.location], default=t)
 
     winner = simplest(winner)
-    # Which of two that are alike leads is chance. Every machine has dry friction, so that goes first, then
-    # what has fewer parameters; not what runs worse with the parameters of predictions, as an effect does
-    # that imitates another one.
+    # Chance decides which of two alike candidates leads. Every machine has dry friction, so dry friction
+    # comes first, then the candidate with fewer parameters. A candidate whose free runs are worse with the
+    # parameters of predictions is excepted: such an effect may imitate another one.
     first = _plausibility(winner)
     others = [t for t in able if not _related(t, winner) and _plausibility(t) < first]
     others = [t for t in others if _log_error_ratio(t, winner) <= WINDOWS_APART]
@@ -251,24 +254,25 @@ def choose(
 
 
 def _plausibility(t: ValidatedHypothesis) -> tuple[bool, int]:
-    """What decides between effects that data do not distinguish, the least first."""
+    """Sort key of effects that data do not distinguish: dry friction first, then fewer parameters."""
     assert t.location
     return law_of(t.location.effect) != DRY_FRICTION, t.parameter_count
 
 
 def undecided(found: ValidatedHypothesis, rival: ValidatedHypothesis, left: float, measured: float) -> bool:
-    """Whether a rival in the place of an effect of a poor model remains possible.
+    """Whether a rival remains possible in the place of an effect of a poor model.
 
-    What such a model lacks suits one of two laws better than the other. It cannot make the whole difference
-    where free runs over training and validation data differ by more than is left of their errors, or where
-    predictions lose more than would be gained if what is left were the sensor noise alone. A generalisation
-    must do better besides: without a use for its further parameters it is the law that was found.
+    What such a model lacks may favour one of two laws. It cannot explain the whole difference if free runs
+    over training and validation data differ by more than the errors that are left, or if predictions lose
+    more by the rival than they would gain if only sensor noise were left. A rival that contains the effect
+    found must also be better: if its further parameters are of no use, it is the law that was found.
 
     Args:
-        found: The model that was found; `parameter_count` is that of the effect.
-        rival: The same with the rival in the place of the effect.
-        left: What predictions of training and validation data leave above the sensor noise [nat].
-        measured: How many values of training recordings were measured.
+        found: The model that was found; its `parameter_count` counts the parameters of the effect.
+        rival: The same model with the rival in the place of the effect.
+        left: Log-likelihood that predictions of training and validation data would gain if their errors were
+            the sensor noise alone [nat].
+        measured: Number of measured values in the training recordings.
     """
     if _contained(found, rival) and not (_is_worth(rival, found, measured) or _leads(rival, found)):
         return False
@@ -279,15 +283,16 @@ def undecided(found: ValidatedHypothesis, rival: ValidatedHypothesis, left: floa
 
 
 def better_in_place(rival: ValidatedHypothesis, found: ValidatedHypothesis, measured: float) -> bool:
-    """Whether a rival is to take the place of an effect.
+    """Whether a rival replaces an effect.
 
-    Predictions prefer it beyond doubt, and free runs by a tenth over training and over validation data; or
-    free runs prefer it beyond doubt, over both, and predictions do not distinguish the two.
+    It does if predictions clearly prefer it and free runs have errors smaller by a tenth with it; or if free
+    runs over training and over validation data clearly prefer it, and predictions do not clearly prefer the
+    effect.
 
     Args:
         rival: The model with the rival in the place of the effect.
-        found: The model that was found; `parameter_count` is that of the effect.
-        measured: How many values of training recordings were measured.
+        found: The model that was found; its `parameter_count` counts the parameters of the effect.
+        measured: Number of measured values in the training recordings.
     """
     if _free_runs_insist(rival, found) and not predictions_apart(found, rival):
         return True
@@ -298,21 +303,21 @@ def better_in_place(rival: ValidatedHypothesis, found: ValidatedHypothesis, meas
 
 
 def _leads(rich: ValidatedHypothesis, simple: ValidatedHypothesis) -> bool:
-    """Whether training and validation data both distinguish a generalisation, at one of the horizons.
+    """Whether training and validation data both clearly prefer a richer effect, at one of the horizons.
 
-    What it gains need not be worth its parameters: beside what a poor model leaves, that size says little.
+    The gain need not exceed the penalty for the parameters: in a poor model, the size of a gain says little.
     """
     certainty = paired_gain(rich.blocks, simple.blocks)[1], _training_gain(rich, simple)[1]
     return min(certainty) > SEPARATE_Z or _free_run_certainty(rich, simple) > SEPARATE_Z
 
 
 def _is_worth(rich: ValidatedHypothesis, simple: ValidatedHypothesis, measured: float) -> bool:
-    """Whether predictions of validation data prefer a generalisation, and of training data after the penalty.
+    """Whether predictions prefer a richer effect: of validation data, and of training data after the penalty.
 
     Args:
-        rich: The generalisation.
-        simple: What it contains.
-        measured: How many values of training recordings were measured.
+        rich: The model with the richer effect.
+        simple: The model with the effect that it contains.
+        measured: Number of measured values in the training recordings.
     """
     more = rich.parameter_count - simple.parameter_count
     gain = rich.log_likelihood - simple.log_likelihood
@@ -320,7 +325,7 @@ def _is_worth(rich: ValidatedHypothesis, simple: ValidatedHypothesis, measured: 
 
 
 def needed_gain(parameter_count: int, measured: float) -> float:
-    """Gain on training data that so many more parameters have to bring [nat]."""
+    """Least gain on training data that justifies a number of further parameters [nat]."""
     return TRAIN_NATS + 0.5 * parameter_count * float(np.log(measured))
 
 
@@ -330,20 +335,20 @@ def replaced_by(
     after: Sequence[list[Score]],
     tried: Sequence[EffectLocation],
 ) -> list[EffectLocation]:
-    """Candidates that promised much and promise nothing beside the winner: it may stand in their place.
+    """Candidates with a high score without the winner and none with it: the winner may stand in their place.
 
-    Effects that do nearly the same at the motion of a recording (a dead zone of the input and friction at
-    the hub, where the hub stops at every reversal) take each other's score. Which of them is refitted first
-    is decided by slopes beside a model that lacks all of them, so those that lost theirs are refitted too.
+    Two effects may do nearly the same in the motion of a recording, such as a dead zone of the input and
+    friction at a hub that stops at every reversal. Adding one of them then removes the score of the other.
+    Slopes beside a model that lacks both decide which one is refitted, so the other one is refitted too.
 
     Args:
-        winner: Effect that is going to be added; what contains it can still be added later.
-        before: Scores beside the model without it, of predictions and of free runs, best first.
-        after: The same beside the model with it.
-        tried: Effects that were refitted beside the model without it.
+        winner: Effect that is going to be added. Effects that contain it can still be added later.
+        before: Scores beside the model without the winner, of predictions and of free runs, best first.
+        after: Scores beside the model with the winner.
+        tried: Effects that were refitted beside the model without the winner.
 
     Returns:
-        At most `REPLACED` locations, those first that promised most.
+        At most `REPLACED` locations, the highest scores first.
     """
     share: dict[EffectLocation, float] = {}
     for listed, later in zip(before, after, strict=True):
@@ -363,9 +368,9 @@ def replaced_by(
 def validate_from_best_states(
     validation: ValidationSet, candidates: list[ValidatedHypothesis]
 ) -> list[ValidatedHypothesis]:
-    """Candidates; a simpler effect may also start in the first states of a richer one that does better.
+    """Candidates; a simpler effect is validated again from the first states of a richer one that is better.
 
-    The search for these states may end in different minima, which must not decide between effects.
+    The fit of first states may end in different minima, which must not decide between effects.
     """
     out = []
     for t in candidates:
@@ -383,13 +388,13 @@ def validate_from_best_states(
 
 
 def distinguished(winner: ValidatedHypothesis, rival: ValidatedHypothesis) -> bool:
-    """Whether all recordings together, block by block, prefer the winner beyond doubt, or free runs do."""
+    """Whether predictions of all recordings, or free runs, distinguish the winner from a worse rival."""
     return free_runs_apart(winner, rival) or predictions_apart(winner, rival)
 
 
 def predictions_apart(winner: ValidatedHypothesis, rival: ValidatedHypothesis) -> bool:
-    """Whether predictions of all recordings together, block by block, prefer the winner beyond doubt."""
-    # Where runs validate each other, the blocks of training are the same samples once more.
+    """Whether predictions of all recordings, by their half-second blocks, clearly prefer the winner."""
+    # Where runs validate each other, the training blocks are the same samples as the validation blocks.
     both = [(t.blocks,) if t.folds else (t.blocks, t.hypothesis.blocks) for t in (winner, rival)]
     a, b = (np.concatenate(blocks) for blocks in both)
     return paired_gain(a, b)[1] >= SEPARATE_Z
@@ -401,10 +406,10 @@ def _alike(
     current: ValidatedHypothesis,
     noise: Float[np.ndarray, " C"],
 ) -> bool:
-    """Whether a rival does what the winner does, as far as a model that leaves so much can tell.
+    """Whether a rival cannot be distinguished from the winner, given the errors that the model leaves.
 
-    Where errors are above twice the noise, one that gains nearly as much counts as alike even if the
-    likelihood distinguishes it.
+    Where errors are above twice the noise, a rival with nearly the same gain counts as alike even if the
+    likelihood distinguishes the two.
     """
     if not distinguished(winner, rival):
         return True
@@ -423,10 +428,10 @@ def _related(a: ValidatedHypothesis, b: ValidatedHypothesis) -> bool:
 
 
 def free_runs_apart(winner: ValidatedHypothesis, rival: ValidatedHypothesis) -> bool:
-    """Whether short free runs distinguish the winner from a rival that is worse.
+    """Whether short free runs distinguish the winner from a worse rival.
 
-    Where half-second blocks of free runs over training or over validation data prefer the rival, the smaller
-    error of the winner on validation data is chance.
+    If half-second blocks of free runs over training or over validation data prefer the rival, the smaller
+    error of the winner on validation data counts as chance.
     """
     if log_best_ratio(rival, winner) <= WINDOWS_APART:
         return False
@@ -434,7 +439,7 @@ def free_runs_apart(winner: ValidatedHypothesis, rival: ValidatedHypothesis) -> 
 
 
 def log_best_ratio(a: ValidatedHypothesis, b: ValidatedHypothesis) -> float:
-    """Mean log ratio of the errors of short free runs, each with the parameters that suit them best."""
+    """Mean log ratio of the errors of short free runs, each as in `best_window_rmse`."""
     return mean_log_ratio(best_window_rmse(a), best_window_rmse(b))
 
 
@@ -448,19 +453,19 @@ def _contained(small: ValidatedHypothesis, large: ValidatedHypothesis) -> bool:
 def _clearly_better(
     rich: ValidatedHypothesis, simple: ValidatedHypothesis, current: ValidatedHypothesis
 ) -> bool:
-    """Whether the richer effect is worth its extra parameters on validation and on training data."""
+    """Whether a richer effect is clearly better than the simpler one, on validation and on training data."""
     nats = paired_gain(rich.blocks, simple.blocks)[0]
     train = rich.hypothesis.log_likelihood - simple.hypothesis.log_likelihood
     share = nats / max(paired_gain(rich.blocks, current.blocks)[0], 1e-9)
     runs_as_well = log_best_ratio(rich, simple) < WINDOWS_BETTER
-    # Few seconds of validation data are few blocks: whether the gain is chance, all blocks say together.
+    # Short validation data have few blocks, so the blocks of all data decide whether the gain is chance.
     return _free_runs_insist(rich, simple) or (
         nats > 10 and train > 20 and share > 0.003 and runs_as_well and predictions_apart(rich, simple)
     )
 
 
 def _free_runs_insist(candidate: ValidatedHypothesis, current: ValidatedHypothesis) -> bool:
-    """Whether free runs alone show beyond doubt that a candidate is better."""
+    """Whether free runs alone clearly prefer a candidate: by errors, and by all half-second blocks."""
     runs, before = candidate.free_run, current.free_run
     if runs is None or before is None or _log_error_ratio(runs, before) > -FREE_RUN_BETTER:
         return False
@@ -468,7 +473,7 @@ def _free_runs_insist(candidate: ValidatedHypothesis, current: ValidatedHypothes
 
 
 def _free_run_certainty(a: ValidatedHypothesis, b: ValidatedHypothesis) -> float:
-    """By how many standard deviations free runs prefer `a`, the less of training and of validation data."""
+    """Standard deviations by which free runs prefer `a`; the smaller one of training and validation data."""
     runs, others = a.free_run, b.free_run
     assert runs and others
     return min(paired_gain(runs.blocks, others.blocks)[1], _training_gain(runs, others)[1])

@@ -1,4 +1,4 @@
-"""Maps of splines fitted through the simulator, orthogonal to the physics, and formulas that read them."""
+"""Fits of spline maps of a torque through the simulator, orthogonal to the physics, and formulas for them."""
 
 import dataclasses
 import functools
@@ -15,17 +15,18 @@ from rotflex_jax.effects.learned import LearnedTorque
 from rotflex_jax.fit.coordinates import FitCoordinates
 from rotflex_jax.optimise.damped_least_squares import LARGEST_STEP, NormalEquations, Rules, after_trial, begin
 
-# A step that lowers the penalised cost by less is the last with its process noise [nat].
+# Steps with one process noise end when a step lowers the penalised cost by less than this [nat].
 MIN_STEP_NATS = 0.3
 MAP_RULES = Rules(damping=1e-6, least=1e-9, increase=20)
-# Steps tried from one linearisation.
+# Largest number of trial steps from one linearisation.
 TRIALS_PER_STEP = 6
-# Steps with one process noise, and how often it is chosen.
+# Largest number of steps with one process noise, and number of rounds, each with another process noise.
 STEPS_PER_NOISE, NOISE_CHOICES = 6, 3
-# Largest smoothness, and the one beyond which a map is flat, as multiples of the smallest (weights as large
-# as the torque of the motor).
+# Largest smoothness, and smoothness beyond which a map counts as flat, as multiples of the smallest one,
+# which allows weights as large as the torque of the motor.
 MAX_SMOOTHNESS, FLAT_SMOOTHNESS = 1e7, 1e6
-# Neighbouring samples are correlated: slopes of the likelihood are independent over such stretches [s].
+# Neighbouring samples are correlated; gradients of the likelihood count as independent between stretches of
+# this length [s].
 INDEPENDENT_SECONDS = 0.5
 
 
@@ -35,12 +36,13 @@ class MapEquations:
 
     Attributes:
         H: Curvature of half the sum of squared whitened innovations.
-        g: Its slope.
-        rest: Coordinates that are no weight of the map: physics, offsets, first states.
-        physics: Those of the physics alone.
-        weights: Those of the weights.
-        cost: Half the sum of squares.
-        excess: How many times the slope scatters more than independent innovations would make it.
+        g: Gradient of half the sum of squared whitened innovations.
+        rest: Indices of coordinates other than the weights of the map: physics, offsets, first states.
+        physics: Indices of the coordinates of the physics alone.
+        weights: Indices of the weights of the map.
+        cost: Half the sum of squared whitened innovations.
+        excess: Variance of the gradient over its variance for independent innovations (mean over the
+            weights), at least 1.
     """
 
     H: Float[np.ndarray, "M M"]
@@ -52,7 +54,7 @@ class MapEquations:
     excess: float
 
     def projected(self) -> tuple[Float[np.ndarray, "W W"], Float[np.ndarray, " W"]]:
-        """Curvature and slope along the weights with all other coordinates at their optimum."""
+        """Curvature and gradient along the weights, with all other coordinates at their optimum."""
         solved = np.linalg.lstsq(
             self.H[np.ix_(self.rest, self.rest)],
             np.c_[self.H[np.ix_(self.rest, self.weights)], self.g[self.rest]],
@@ -88,14 +90,15 @@ def map_equations(problem: LikelihoodProblem, h: Hypothesis, weights: list[int])
 
 
 def position_differences(effect: LearnedTorque) -> Float[np.ndarray, "D W"]:
-    """Differences of neighbouring weights along the position."""
+    """Matrix that gives the differences of neighbouring weights along the position."""
     return np.kron(np.diff(np.eye(effect.count[0]), axis=0), np.eye(effect.count[1]))
 
 
 def penalties(effect: LearnedTorque) -> list[Float[np.ndarray, "W W"]]:
-    """Squared differences of neighbours along position and along speed, and squared weights.
+    """Penalty matrices of squared differences along position and along speed, and of squared weights.
 
-    First differences, because a torque may jump: where friction reverses, neighbouring weights may differ.
+    They use first differences, since a torque may jump: neighbouring weights may differ where friction
+    reverses.
     """
     across = np.kron(np.eye(effect.count[0]), np.diff(np.eye(effect.count[1]), axis=0))
     whole = np.eye(effect.count[0] * effect.count[1])
@@ -107,11 +110,11 @@ class FittedMap:
     """A fitted map.
 
     Attributes:
-        hypothesis: With its weights among the free parameters.
-        basis: Columns: directions of the weights that the physics cannot imitate.
-        covariance: Of the weights in unconstrained coordinates, everything else being free.
-        flat: Whether the recordings ask for no dependence on the position.
-        equations: At the fit.
+        hypothesis: The hypothesis with the weights of the map among its free parameters.
+        basis: Basis (in columns) of the weights that the physics cannot imitate.
+        covariance: Covariance of the weights in unconstrained coordinates, with everything else free.
+        flat: Whether the map hardly depends on the position, by its smoothness.
+        equations: Normal equations at the fit.
     """
 
     hypothesis: Hypothesis
@@ -129,18 +132,21 @@ def fit_map(
     excluded: Float[np.ndarray, "W A"],
     size: float,
 ) -> FittedMap:
-    """Gauss-Newton on innovations and penalty; smoothness by marginal likelihood.
+    """Fit a map to the innovations with a smoothness penalty, whose weights maximise the marginal likelihood.
 
-    The map is kept orthogonal to `excluded`, what the physics of the model gives at its port: a slope over
-    the speed is the damper's, so the parameters of the physics stay unique.
+    Damped Gauss-Newton steps alternate with updates of the smoothness and of the process noise.
+
+    The map is orthogonal to `excluded`, the torques that the physics of the model can give at the port. A
+    torque proportional to the speed, for example, belongs to the damper. So the parameters of the physics
+    stay unique.
 
     Args:
-        problem: With the training recordings.
+        problem: Likelihood of the training recordings.
         h: The model without the map, at its optimum.
-        effect: The map, for its shape.
+        effect: The map, which gives the number of splines.
         weights: Indices of its weights in the super-model's values.
-        excluded: Combinations of the weights that stay zero.
-        size: Weight that would be large [in unconstrained coordinates].
+        excluded: Combinations of the weights (in columns) that stay zero.
+        size: Size of a large weight [in unconstrained coordinates].
 
     Source: B. Györök et al., arXiv 2501.05842, 2025 (orthogonality); S. Wood and M. Fasiolo, Biometrics 73,
     2017 (smoothness).
@@ -184,7 +190,7 @@ def _smoother(
     z: np.ndarray,
     loosest: float,
 ) -> np.ndarray:
-    """Smoothness of larger marginal likelihood (the update of Fellner and Schall, repeated)."""
+    """Smoothness of larger marginal likelihood, by repeated updates of Fellner and Schall."""
     H, g = equations.projected()
     H, g = basis.T @ H @ basis / equations.excess, basis.T @ (H @ z - g) / equations.excess
     S = [basis.T @ s @ basis for s in S]
@@ -211,7 +217,7 @@ def _step(
     weights: list[int],
     damping: float,
 ) -> tuple[Hypothesis, float, float]:
-    """One step that lowers the penalised cost; the hypothesis, what was gained, the damping."""
+    """One step that lowers the penalised cost: the new hypothesis, the decrease of the cost, the damping."""
     seen, rest, own = problem.seen, equations.rest, equations.weights
     free = np.zeros((len(equations.g), len(rest) + basis.shape[1]))
     free[rest, np.arange(len(rest))] = 1.0
@@ -237,16 +243,18 @@ def _step(
     return h, 0.0, float(progress.damping)
 
 
-# Most terms of a formula, the share that the last of them must explain, and what its coefficient costs [nat].
+# Largest number of terms of a formula, least share that the last term must explain, and penalty for its
+# coefficient [nat].
 MAX_TERMS, MIN_TERM_SHARE, TERM_NATS = 4, 0.02, 10.0
-# A term of whose trace less than this share is left beside the physics explains nothing of its own.
+# A term is not tried if the share of its effect that the physics cannot imitate is no larger than this.
 MIN_OWN_SHARE = 1e-3
-# Samples at which terms are compared with splines.
+# Largest number of samples at which terms are approximated by splines.
 COMPARED_SAMPLES = 5000
 
 TermFunction = Callable[[Float[np.ndarray, "..."], Float[np.ndarray, "..."], float], Float[np.ndarray, "..."]]
 
-# In `q`, position [rad], and `w`, speed [rad/s], with a parameter `n` of their own where they need one.
+# Term -> what the unit of its coefficient has after N m, and its function of position `q` [rad], speed `w`
+# [rad/s] and, for some terms, a parameter `n`.
 FUNCTIONS: dict[str, tuple[str, TermFunction]] = {
     "1": ("", lambda q, w, n: np.ones_like(q)),
     "q": ("/rad", lambda q, w, n: q),
@@ -271,10 +279,10 @@ class Term:
 
     Attributes:
         function: Key of `FUNCTIONS`.
-        n: Its own parameter: a speed [rad/s], or waves per turn.
-        coefficient: [N m and `unit`].
-        std: Its standard deviation.
-        share: Of what the map explains, added by this term.
+        n: Parameter of the function: a speed [rad/s], or waves per turn; 0 where there is none.
+        coefficient: Coefficient [`unit`].
+        std: Standard deviation of the coefficient.
+        share: Share that this term adds of what the map explains.
     """
 
     function: str
@@ -290,13 +298,13 @@ class Term:
 
     @property
     def unit(self) -> str:
-        """Of the coefficient."""
+        """Unit of the coefficient."""
         return "N m" + FUNCTIONS[self.function][0]
 
     def __call__(
         self, position: Real[np.ndarray, "..."], speed: Real[np.ndarray, "..."]
     ) -> Float[np.ndarray, "..."]:
-        """Torque [N m]."""
+        """Torque of the term [N m]."""
         return self.coefficient * FUNCTIONS[self.function][1](position, speed, self.n)
 
     def __str__(self) -> str:
@@ -305,23 +313,23 @@ class Term:
 
 @dataclasses.dataclass(frozen=True)
 class Formula:
-    """A sum of terms that stands for a learned map.
+    """A sum of terms that approximates a learned map.
 
     Attributes:
-        terms: In the order they were chosen; none where no term explains enough.
+        terms: Terms, the one that explains most alone first; empty where no term explains enough.
     """
 
     terms: tuple[Term, ...]
 
     @property
     def share(self) -> float:
-        """What the terms explain together of what the map explains."""
+        """Share that the terms explain together of what the map explains."""
         return sum(t.share for t in self.terms)
 
     def __call__(
         self, position: Real[np.ndarray, "..."], speed: Real[np.ndarray, "..."]
     ) -> Float[np.ndarray, "..."]:
-        """Torque [N m] by the formula."""
+        """Torque of the formula [N m]."""
         q, w = np.broadcast_arrays(np.asarray(position, float), np.asarray(speed, float))
         return sum((t(q, w) for t in self.terms), np.zeros(q.shape))
 
@@ -330,7 +338,7 @@ class Formula:
 
 
 def terms_to_try(position: Float[np.ndarray, " N"], speed: Float[np.ndarray, " N"]) -> list[Term]:
-    """Terms worth trying on samples of this size; waves only where the port travels far enough."""
+    """Terms worth trying for these positions and speeds; waves only where the port travels far enough."""
     turning, span = float(np.sqrt(np.mean(speed**2))), float(np.ptp(position))
     waves = [float(n) for n in range(1, 13) if n * span > 2.0]
     out = []
@@ -346,19 +354,19 @@ def read_formula(
     position: Float[np.ndarray, " N"],
     speed: Float[np.ndarray, " N"],
 ) -> Formula:
-    """The formula of a map, by a search for few terms in the metric of the recordings.
+    """The formula of a map, found by a search for few terms in the metric of the recordings.
 
         minimise  (c - D a)' H (c - D a),   H: information on the weights c, with the physics projected out
 
-    A column of `D` has the weights that come nearest to a term. In this metric a term that the physics
-    of the model can imitate (`w` beside a damper) has no size, and a rounded step is as good as a sharp
-    one where no sample distinguishes them. The coefficients are those of the data, not of the smoothed map.
+    A column of `D` has the weights that approximate a term best. In this metric a term that the physics of
+    the model can imitate (`w` beside a damper) has size zero, and a rounded step is as good as a sharp step
+    if no sample distinguishes them. The coefficients are fitted to the data and not to the smoothed map.
 
     Args:
         fitted: Fitted map.
-        effect: Its shape.
-        position: Of the port along the recordings [rad].
-        speed: [rad/s].
+        effect: The map with its splines.
+        position: Position of the port along the recordings [rad].
+        speed: Speed of the port along the recordings [rad/s].
 
     Source: S. Chen, S. Billings and W. Luo, Int. J. Control 50, 1989 (error reduction); S. Brunton,
     J. Proctor and N. Kutz, PNAS 113, 2016 (formulas from a dictionary).
@@ -400,10 +408,10 @@ def read_formula(
 
 
 def _sets(G: np.ndarray, r: np.ndarray, able: list[int]) -> Iterator[list[int]]:
-    """The best set of one term, of two, of three and so on, the strongest term first.
+    """The best set of one term, of two, of three and so on, with the strongest term of a set first.
 
-    One and two are tried out in full, since two terms may explain together what neither does alone; larger
-    sets grow by one and exchange members as long as that helps.
+    All sets of one and of two terms are tried, since two terms may explain together what neither explains
+    alone. Larger sets grow by one term and exchange members as long as that helps.
     """
     value = functools.partial(_explained, G, r)
     best: list[int] = []
@@ -424,7 +432,7 @@ def _sets(G: np.ndarray, r: np.ndarray, able: list[int]) -> Iterator[list[int]]:
 
 
 def _explained(G: np.ndarray, r: np.ndarray, chosen: list[int]) -> float:
-    """Twice the log-likelihood that terms explain; one that the others already span adds nothing."""
+    """Twice the log-likelihood that terms explain; 0 if the terms are nearly linearly dependent."""
     if not chosen:
         return 0.0
     own = G[np.ix_(chosen, chosen)]

@@ -54,10 +54,13 @@ from rotflex_jax.runtime.xla import on_threads
 
 
 def fit_baseline(problem: LikelihoodProblem) -> Hypothesis:
-    """The user's model with calibrations, fitted from a short, a middle and an endless prediction horizon."""
+    """The user's model with calibrations, fitted from a short, a medium and a very long prediction horizon.
+
+    A large process noise gives a short horizon, a small one a long horizon. The likeliest fit is returned.
+    """
     least, most = problem.process_noise_range
     intensities = (most, np.sqrt(least * most), least)
-    # A distant start is safe only with a short horizon: all paths begin with one.
+    # From parameters far off, a fit converges safely only with a short horizon: all paths begin with one.
     near = problem.with_process_noise(values_given(problem), dict.fromkeys(problem.ports, 100 * most))
     problem.make_ahead([near])
     near = refit(problem, [near], alternations=0)[0]
@@ -66,13 +69,14 @@ def fit_baseline(problem: LikelihoodProblem) -> Hypothesis:
 
 
 def fit_free_run_baseline(problem: LikelihoodProblem, prediction: Hypothesis) -> Hypothesis:
-    """The user's model fitted to free runs, from the parameters of predictions and from the given ones.
+    """The user's model fitted to free runs, from the fit to predictions and from the given values.
 
-    Where a model lacks what holds a machine at rest, the likeliest predictor may be one that hardly moves: an
-    inertia without end. No parameter has a slope there, and free runs would not find back.
+    Where a model lacks what holds a machine at rest, the likeliest predictor may be a machine that hardly
+    moves, with an inertia that grows without limit. There the slopes of all parameters vanish, and a fit to
+    free runs would not leave this point.
 
     Args:
-        problem: Of free runs.
+        problem: Likelihood of free runs.
         prediction: The user's model fitted to predictions.
     """
     starts = [as_free_run(problem, h) for h in (prediction, values_given(problem))]
@@ -80,12 +84,12 @@ def fit_free_run_baseline(problem: LikelihoodProblem, prediction: Hypothesis) ->
     return max(refit(problem, able), key=lambda h: h.log_likelihood)
 
 
-# A positive parameter that a fit has moved by more than this factor from the value that was given.
+# A positive parameter is far from its given value if a fit has changed it by more than this factor.
 FAR_FROM_GIVEN = 10.0
 
 
 def far_from_given(s: SuperModel, h: Hypothesis) -> list[int]:
-    """Indices of positive parameters of the user's model that a fit has moved far from the values given."""
+    """Indices of positive parameters of the user's model that a fit has moved far from their given values."""
     i = np.array(s.baseline_free)
     given, found = s.mechanism.values[i], h.mean_values(s)[i]
     positive = np.minimum(given, found) > 0
@@ -94,14 +98,14 @@ def far_from_given(s: SuperModel, h: Hypothesis) -> list[int]:
 
 
 def as_given(horizons: Horizons) -> ValidatedHypothesis:
-    """The user's model with the values that it has and the process noise that suits these, validated."""
+    """The user's model with its given values and the likeliest process noise for them, validated."""
     problem = horizons.prediction.problem
     h = choose_process_noise(problem, values_given(problem), wide=True)
     return horizons.validated(h, as_free_run(horizons.free_run.problem, h))
 
 
 def values_given(problem: LikelihoodProblem) -> Hypothesis:
-    """The user's model with the values that it has, and calibrations of zero."""
+    """The user's model with its given values and all calibrations at zero."""
     s, first = problem.supermodel, problem.windows.first_states
     R, C = len(first), len(s.mechanism.channels)
     z = s.transform.unconstrain(s.mechanism.values)
@@ -120,11 +124,11 @@ def values_given(problem: LikelihoodProblem) -> Hypothesis:
     )
 
 
-# Steps tried of each shape of a candidate before the best one is chosen.
+# Steps of the fit from each shape of a candidate before the best shape is chosen.
 SHAPE_CHOICE_STEPS = 6
-# Shares of the amplitude that the score test suggests at which a refit may start.
+# A refit may start at these shares of the amplitude that the score test suggests.
 AMPLITUDE_SHARES = (1.0, 0.4, 0.1, 0.02)
-# A refit that gains less than this share of what the score test expects has not converged to the effect.
+# A refit that gains less than this share of the gain that the score test expects has missed the optimum.
 STUCK_SHARE = 0.5
 
 
@@ -133,17 +137,19 @@ def refit_candidates(
 ) -> list[Hypothesis]:
     """The current model with each candidate added and refitted.
 
-    First order overshoots where an effect is strongly nonlinear, so a refit starts at the likeliest of
-    several shares of the amplitude, and at the shape with which a few steps gain most. One that ends far
-    below what the score test expects starts again from a small amplitude of every shape. An effect with
-    memory takes the place of the simpler one that it contains: two in parallel would be a third effect.
+    The amplitude that the score test suggests is too large where an effect is strongly nonlinear. So a refit
+    starts at the likeliest of several shares of this amplitude, and at the shape with which a few steps gain
+    most. If a refit gains far less than the score test expects, it starts again from a small amplitude of
+    every shape. An effect with memory replaces the simpler effect that it contains, since the two in parallel
+    would be a third effect.
     """
     s = problem.supermodel
     for c in starts:
         make_ahead(problem.slopes, [with_candidate(s, current, c, AMPLITUDE_SHARES[0])])
-    # Each from start to end on one thread: the others need not wait for the slowest after every stage.
+    # Each candidate has one thread from start to end, so none waits for the slowest one after every stage.
     refitted = on_threads(lambda c: _refit_candidate(problem, current, c), starts)
-    # An effect that contains another one is never worse: where a refit is, it starts again from that one.
+    # At its optimum an effect is no worse than an effect that it contains. A refit that is worse starts again
+    # from the fit with the contained effect.
     below = [
         (i, replacing(s, refitted[j], [b.location], a, AMPLITUDE_SHARES[-1]))
         for i, a in enumerate(starts)
@@ -154,7 +160,7 @@ def refit_candidates(
 
 
 def _refit_candidate(problem: LikelihoodProblem, current: Hypothesis, start: CandidateStart) -> Hypothesis:
-    """The same with one candidate, which is compared with no other."""
+    """The current model with one candidate, refitted as in `refit_candidates`, without other candidates."""
     shapes = [dataclasses.replace(start, values=x) for x in (start.values, *start.others)]
     grown = [
         [with_candidate(problem.supermodel, current, shape, share) for share in AMPLITUDE_SHARES]
@@ -175,7 +181,13 @@ def _refit_candidate(problem: LikelihoodProblem, current: Hypothesis, start: Can
 def refit_from(
     problem: LikelihoodProblem, refitted: list[Hypothesis], starts: list[tuple[int, Hypothesis]]
 ) -> list[Hypothesis]:
-    """Refits, some also from other starts (index of the candidate, start); the likelier one is kept."""
+    """Refits of candidates, some of them repeated from other starts; the likelier fit of each is kept.
+
+    Args:
+        problem: The likelihood.
+        refitted: Fits so far, one for each candidate.
+        starts: Index of a candidate and another start for it.
+    """
     best = list(refitted)
     fitted = refit(problem, [h for _, h in starts]) if starts else []
     for (i, _), h in zip(starts, fitted, strict=True):
@@ -186,13 +198,13 @@ def refit_from(
 def refit_near_predictions(
     problem: LikelihoodProblem, refitted: list[Hypothesis], predictions: Sequence[Hypothesis]
 ) -> list[Hypothesis]:
-    """Refits to free runs, each also from the parameters that suit predictions; the likelier one is kept.
+    """Refits to free runs, repeated from the fits to predictions; the likelier fit of each is kept.
 
-    The cost of free runs has many local minima: one near the parameters of predictions may be better.
+    The cost of free runs has many local minima. A minimum near the parameters of predictions may be better.
 
     Args:
-        problem: Of free runs.
-        refitted: Fitted to them.
+        problem: Likelihood of free runs.
+        refitted: Models fitted to free runs.
         predictions: The same structures, fitted to predictions.
     """
     begun = enumerate(on_threads(lambda h: as_free_run(problem, h), predictions))
@@ -200,13 +212,13 @@ def refit_near_predictions(
 
 
 class Eliminated(NamedTuple):
-    """A model with what is needed at both horizons.
+    """A model after backward elimination: only the effects that are needed at one of the horizons.
 
     Attributes:
-        prediction: Fitted to predictions.
-        free_run: Fitted to free runs.
-        worth: What each effect that was tested gains [nat].
-        without: The model of predictions without each of them, refitted.
+        prediction: The model fitted to predictions.
+        free_run: The model fitted to free runs.
+        worth: Each effect that was tested -> its gain in log-likelihood of training predictions [nat].
+        without: For each effect that was tested, the model without it, refitted to predictions.
     """
 
     prediction: Hypothesis
@@ -216,19 +228,19 @@ class Eliminated(NamedTuple):
 
 
 def eliminate(horizons: Horizons, h: Hypothesis, runs: Hypothesis, added: list[EffectLocation]) -> Eliminated:
-    """Drop, one at a time, effects without which the model is as good at both horizons.
+    """Backward elimination: drop, one at a time, effects without which the model is as good at both horizons.
 
-    The effect added last has just shown that it is needed; earlier ones may have become needless, and
-    calibrations have shown nothing yet.
+    The effect added last is not tested, since it has just passed the tests of its round. Effects added
+    earlier may have become unnecessary, and calibrations have not been tested yet.
 
     Args:
-        horizons: With the training recordings.
+        horizons: Training and validation recordings at both horizons.
         h: The model fitted to predictions.
-        runs: The same fitted to free runs.
-        added: Effects in the order they were added.
+        runs: The same structure fitted to free runs.
+        added: Effects in the order in which they were added.
 
     Returns:
-        The model with what is needed at both horizons, and what was tested last.
+        The model with the effects that are needed, and the results of the last test of each.
     """
     problem, runs_problem = horizons.prediction.problem, horizons.free_run.problem
     s, rivals = problem.supermodel, []
@@ -241,7 +253,7 @@ def eliminate(horizons: Horizons, h: Hypothesis, runs: Hypothesis, added: list[E
         for p, r in zip(tested, rivals, strict=True):
             if p in s.calibrations:
                 continue
-            # An effect that gains in a few moments of the recording only is not needed.
+            # An effect whose gain comes from a few moments of the recording only is not needed.
             if paired_gain(h.blocks, r.blocks)[1] < TRAIN_Z:
                 surplus[p] = min(surplus[p], -1.0)
         needless = sorted((p for p in tested if surplus[p] < 0), key=lambda p: surplus[p])
@@ -267,16 +279,16 @@ def eliminate(horizons: Horizons, h: Hypothesis, runs: Hypothesis, added: list[E
 def refit_without(
     problem: LikelihoodProblem, h: Hypothesis, locations: Sequence[EffectLocation], alternations: int = 3
 ) -> list[Hypothesis]:
-    """The model without each of some effects, refitted.
+    """The model without each of some effects in turn, refitted.
 
-    Where a law that contains the effect can take over its size, a second fit starts with it there, and the
-    likelier end counts: from the size that the law has beside it a fit may end in another minimum, as if
-    both were needed.
+    If the model has a law that contains the effect and can take over its size, a second fit starts with this
+    size in the law. The likelier fit is kept. A fit from the size that the law has beside the effect may end
+    in another minimum, as if both were needed.
 
     Args:
         problem: The likelihood.
         h: The model.
-        locations: What is left out, one at a time.
+        locations: Effects that are left out, one at a time.
         alternations: See `refit`.
     """
     s = problem.supermodel
@@ -296,27 +308,27 @@ def _need(
     """Whether free runs are clearly worse without an effect, over training or over validation recordings.
 
     Args:
-        horizons: With the recordings.
-        as_it_is: The model at both horizons on validation data, the same for all effects.
+        horizons: Training and validation recordings at both horizons.
+        as_it_is: Gives the model with all effects, validated at both horizons.
         runs: The model fitted to free runs.
         location: The effect.
-        less: The model of predictions without it.
+        less: The model without the effect, fitted to predictions.
     """
     problem = horizons.free_run.problem
     (less_runs,) = refit_without(problem, runs, [location], alternations=1)
     gain, z = paired_gain(runs.blocks, less_runs.blocks)
     if z > FREE_RUN_Z and gain / len(runs.blocks) > FREE_RUN_BETTER:
         return True
-    # A fit without it may suit the training recordings with parameters that suit no others.
+    # A fit without the effect may describe the training recordings with parameters that fail on others.
     return log_best_ratio(as_it_is(), horizons.validated(less, less_runs, as_it_is())) < -FREE_RUN_BETTER
 
 
 class RemainingRivals(NamedTuple):
-    """What looks like the effects that were found.
+    """Rivals of the effects that were found: effects that may stand in their places.
 
     Attributes:
-        alike: Effects that were found -> those that the final model cannot exclude in their places.
-        swapped: The final model with each rival in the place of an effect, validated.
+        alike: Each effect that was found -> rivals that the recordings cannot exclude in its place.
+        swapped: The final model with each rival in the place of the effect, refitted and validated.
     """
 
     alike: dict[EffectLocation, list[EffectLocation]]
@@ -330,14 +342,14 @@ def remaining_rivals(
     rivals: dict[EffectLocation, list[EffectLocation]],
     found: list[EffectLocation],
 ) -> RemainingRivals:
-    """Rivals that the final model, with one of them in the place of a found effect, cannot exclude.
+    """Rivals that the recordings cannot exclude, tested in the final model in the place of a found effect.
 
-    What looked alike in a round may be distinguished once the other effects are in the model; a rival that
-    was itself found in another round is no rival.
+    Two effects that were not distinguished in their round may be distinguished once all other effects are in
+    the model. A rival that was itself found in another round does not count.
     """
     s = problem.supermodel
     remaining = {p: [r for r in rivals[p] if r not in found] for p in found}
-    # One that is refitted at its line has passed already beside the models of its round.
+    # A periodic disturbance remains a rival without a test: it was refitted at its frequency in its round.
     pairs = [(p, r) for p in found for r in remaining[p] if not CATALOG[r.effect].line]
     if not pairs or len(found) == 1:
         return RemainingRivals(remaining, [])
@@ -358,10 +370,10 @@ def nested_models(
     own: Sequence[EffectLocation],
     passed: Sequence[Hypothesis],
 ) -> list[Hypothesis]:
-    """The baseline alone, then with one more effect at a time, each refitted; the final model last.
+    """The baseline, then models with one more effect at a time, each refitted; the final model last.
 
-    A model that the search has passed, calibrations apart, starts from there. Calibrations that belong
-    to recordings (`own`) are in every model.
+    If the search has fitted a model with the same effects (calibrations aside), the refit starts from it,
+    else from the final model. Calibrations that belong to single recordings (`own`) are in every model.
     """
     s, below = problem.supermodel, []
     calibrations = set(s.calibrations)
@@ -375,20 +387,21 @@ def nested_models(
     return [*(refit(problem, below, wide=True, alternations=2) if below else []), final]
 
 
-# What one effect may lose against several, beyond the penalty for its fewer parameters [nat].
+# Log-likelihood that one effect may lose against several, beyond the penalty for the parameters saved [nat].
 MERGE_LOSS_NATS = 2.0
 
 
 @dataclasses.dataclass(frozen=True)
 class MergedEffects:
-    """Several effects that are one effect as well.
+    """One effect that replaces several effects.
 
     Attributes:
         final: The hypothesis with the one effect.
         effect: The one effect.
-        simpler: The effect that it contains.
-        replaced: All that it stands for.
-        same_count: Whether it needs as many parameters as they, so that the data do not prefer the one.
+        simpler: The effect among the replaced ones that it contains.
+        replaced: The simpler effect and the calibrations that it replaces.
+        same_count: Whether the one effect has as many parameters as they have together. Then the data do not
+            prefer it.
         validated: The hypothesis on validation data.
     """
 
@@ -401,7 +414,7 @@ class MergedEffects:
 
     @property
     def note(self) -> str:
-        """The merge in a sentence, for the reader of the result."""
+        """The replacement in a sentence, for the reader of the result."""
         several = " and ".join(map(titled, self.replaced))
         count = "as many parameters" if self.same_count else "more parameters"
         return (
@@ -421,15 +434,15 @@ def merge_effects(
     final: ValidatedHypothesis,
     order: Sequence[EffectLocation],
 ) -> MergedEffects | None:
-    """The one effect that does without the machine's calibrations what the final model does with them.
+    """Find one effect that explains as much as an effect of the final model and the machine's calibrations.
 
-    A constant torque is a voltage offset at the hub and a shifted deflection at the joint, and an
-    asymmetric friction is a symmetric one and a constant torque: calibrations, which are in every model,
-    take its asymmetry away before a search can ask for it. Fewer effects that explain as much are the
-    better answer.
+    A constant torque at the hub looks like a voltage offset, a constant torque at the joint like an offset of
+    the deflection. An asymmetric friction is a symmetric friction and a constant torque. Calibrations are in
+    every model of the search, so they explain the asymmetry before an asymmetric friction can. If one effect
+    explains as much as several, it is the better answer.
 
     Args:
-        problem: With the training recordings.
+        problem: Likelihood of the training recordings.
         validation: The validation recordings.
         final: The final model.
         order: Its effects and the calibrations that belong to the machine.
@@ -473,13 +486,13 @@ def merge_effects(
 
 @dataclasses.dataclass(frozen=True)
 class AssignedCalibrations:
-    """Where the calibrations of a final model belong.
+    """Which calibrations of a final model belong to the machine, and which to single recordings.
 
     Attributes:
         final: The final model, on validation data.
         order: Effects and calibrations of the machine, in order.
         own: Calibrations that belong to the training recordings alone.
-        notes: A remark for the reader where calibrations were left out altogether.
+        notes: A remark for the reader if all calibrations were left out.
     """
 
     final: ValidatedHypothesis
@@ -491,7 +504,7 @@ class AssignedCalibrations:
 def assign_calibrations(
     problem: LikelihoodProblem, validation: ValidationSet, final: Hypothesis, order: list[EffectLocation]
 ) -> AssignedCalibrations:
-    """Decide whether the calibrations of a final model are the machine's, the recordings' or needless."""
+    """Decide whether calibrations of the final model belong to the machine, to recordings, or to neither."""
     calibrations = [p for p in order if p in problem.supermodel.calibrations]
     validated = validate(validation, final)
     order, own = _split_calibrations(validation, validated, order)
@@ -508,9 +521,10 @@ def assign_calibrations(
 def _split_calibrations(
     validation: ValidationSet, final: ValidatedHypothesis, order: list[EffectLocation]
 ) -> tuple[list[EffectLocation], list[EffectLocation]]:
-    """Effects of the machine, and calibrations that belong to the training recordings alone.
+    """Effects and calibrations of the machine, and calibrations that belong to the training recordings alone.
 
-    A calibration is one of the machine if its trained value makes validation runs clearly better.
+    A calibration belongs to the machine if its trained value makes free runs over the validation recordings
+    clearly better.
     """
     s = validation.problem.supermodel
     kept, own, trained = list(order), [], final.with_trained_calibrations(s)
@@ -529,10 +543,10 @@ def _better_without(
     final: ValidatedHypothesis,
     order: Sequence[EffectLocation],
 ) -> ValidatedHypothesis | None:
-    """The final model fitted without calibrations, where that runs better on the validation recordings.
+    """The final model fitted without calibrations, if its free runs over validation data are better; or None.
 
-    Training recordings may ask for offsets that the validation recordings do not share; parameters fitted
-    beside such offsets are then further off than those fitted as if there were none.
+    Training recordings may have offsets that the validation recordings do not share. A fit with such offsets
+    may then give worse parameters than a fit without any.
     """
     bare, s = final.hypothesis, problem.supermodel
     calibrations = set(bare.locations) & set(s.calibrations)
@@ -550,13 +564,13 @@ def _better_without(
 def calibration_notes(
     s: SuperModel, final: ValidatedHypothesis, own: Sequence[EffectLocation], used: Mechanism
 ) -> tuple[str, ...]:
-    """What differs between recordings, in sentences.
+    """Sentences on calibrations that differ between recordings, with their values.
 
     Args:
-        s: The calibrations.
-        final: Their values in the training and in the validation recordings.
-        own: Those that the search does not carry over.
-        used: The mechanism to use, which may have what all runs have in common of them.
+        s: The super-model.
+        final: The final model, with calibrations of the training and of the validation recordings.
+        own: Calibrations that the search does not carry over to other recordings.
+        used: The mechanism of the model to use, which may have values that are common to all runs.
     """
     common = used.named_values
     out = []
@@ -578,7 +592,7 @@ def calibration_notes(
 
 
 def disturbance_notes(s: SuperModel, final: ValidatedHypothesis) -> tuple[str, ...]:
-    """Which disturbances belong to each recording, in sentences."""
+    """Sentences on periodic disturbances, whose size and phase belong to each recording."""
     out = []
     for location in [p for p in final.hypothesis.locations if CATALOG[p.effect].line]:
         amplitudes = [i for i in s.parameter_indices(location) if i in s.phased]

@@ -1,4 +1,4 @@
-"""What a search reports: nested models evaluated, what is left of the baseline localised, and the verdict."""
+"""The result of a search: evaluated nested models, localised errors of the baseline, and the verdict."""
 
 import dataclasses
 import time
@@ -57,18 +57,18 @@ from rotflex_jax.runtime.xla import on_threads
 
 @dataclasses.dataclass(frozen=True)
 class EvaluatedModels:
-    """The final model of a search and those that led to it, on validation and test data.
+    """The final model of a search and the models that led to it, evaluated on validation and test data.
 
     Attributes:
-        stages: Baseline and the models after each effect.
-        final: The last of them, at the horizon that is reported.
+        stages: Baseline, and the models after each effect.
+        final: The final model at the horizon that is reported.
         pairs: Its parameters fitted to training and to validation data.
-        remarks: On its parameters.
-        rounds: What was added, in order.
-        where: When the error of the baseline is large.
+        remarks: Remarks on its parameters.
+        rounds: Effects that were added, in order.
+        where: Where the error of the baseline is large.
         test: Test recordings, used for no fit and no choice.
-        final_fit: The final model fitted to training and validation recordings, or why not; None where it
-            explains its recordings.
+        final_fit: The final model fitted to training and validation recordings, or why this fit was refused;
+            None if the final model explains its recordings.
     """
 
     stages: tuple[Stage, ...]
@@ -82,7 +82,7 @@ class EvaluatedModels:
 
 
 def evaluate_models(state: SearchState, evaluation: Evaluation) -> EvaluatedModels:
-    """Every nested model evaluated, and the error of the baseline localised."""
+    """Evaluate every nested model, and localise the error of the baseline."""
     state.say(beginning("finish", "simulating the validation recordings"))
     reported, model, order = state.reported, state.model, state.order
     problem, validation, final = reported.problem, reported.validation, state.final
@@ -124,12 +124,12 @@ def evaluate_models(state: SearchState, evaluation: Evaluation) -> EvaluatedMode
 
 
 def conclude(state: SearchState, evaluated: EvaluatedModels, started: float) -> Discovery:
-    """The verdict, with all that was found.
+    """The result of a search, with its verdict.
 
     Args:
-        state: What was found.
-        evaluated: The models of it.
-        started: When the search began, by `time.perf_counter` [s].
+        state: The search with what it has found.
+        evaluated: Its models, evaluated.
+        started: Time at which the search began, by `time.perf_counter` [s].
     """
     baseline, final = evaluated.stages[0], evaluated.stages[-1]
     supermodel, remarks = state.problem.supermodel, evaluated.remarks
@@ -174,7 +174,7 @@ def conclude(state: SearchState, evaluated: EvaluatedModels, started: float) -> 
 
 
 def _probabilities(state: SearchState, misfit: float) -> Probabilities:
-    """Probabilities of the sets that were fitted, the one that is reported first."""
+    """Probabilities of the sets that were fitted; the set that is reported comes first in the evidence."""
     reported, horizons = state.reported, state.horizons
     sets = fitted_sets(horizons, state.tried, state.alternatives, reported, state.machine)
     if state.merged:
@@ -183,7 +183,7 @@ def _probabilities(state: SearchState, misfit: float) -> Probabilities:
 
 
 def _conditional(state: SearchState) -> tuple[ConditionalInterval, ...]:
-    """Parameters of the machine on which predictions and free runs of the final structure do not agree."""
+    """Parameters of the machine on which fits of the final model to predictions and free runs disagree."""
     horizons, s = state.horizons, state.problem.supermodel
     if (runs := state.current.free_run) is None:
         return ()
@@ -196,7 +196,7 @@ def _conditional(state: SearchState) -> tuple[ConditionalInterval, ...]:
 
 
 def _far_baseline(state: SearchState) -> tuple[str, ...]:
-    """Parameters of the model as it is that a fit has moved far, in a sentence."""
+    """A sentence on parameters of the user's model that the fit of the baseline has moved far."""
     s, first = state.problem.supermodel, state.passed[0]
     names, specs = s.mechanism.parameter_names, s.mechanism.parameter_specifications
     found = {
@@ -219,7 +219,7 @@ def _far_baseline(state: SearchState) -> tuple[str, ...]:
 
 
 def _run_notes(state: SearchState, test: Sequence[Recording]) -> tuple[str, ...]:
-    """Which offsets test recordings of other runs are evaluated without, in a sentence."""
+    """A sentence on offsets that are left out for test recordings of other runs."""
     held_back = state.validation.problem.dataset.recordings
     runs = KnownRuns.of(state.problem.dataset.recordings, held_back)
     offsets = [p for p in state.order if p in state.problem.supermodel.calibrations]
@@ -232,7 +232,7 @@ def _run_notes(state: SearchState, test: Sequence[Recording]) -> tuple[str, ...]
 
 
 def _resumed(count: int) -> tuple[str, ...]:
-    """That a search went on from what another one had found, in a sentence."""
+    """A sentence that a search continued from a stopped search, given the number of its finished rounds."""
     if not count:
         return ()
     found = "one round" if count == 1 else f"{count} rounds"
@@ -243,21 +243,22 @@ def _resumed(count: int) -> tuple[str, ...]:
 
 
 def _with_process_noise(state: SearchState, stage: Stage, h: Hypothesis, corrected: bool) -> Stage:
-    """A stage with the process noise that makes predictions with its parameters likeliest, and what it gains.
+    """A stage with the likeliest process noise for predictions with its parameters, and the gain by it.
 
     Args:
-        state: What was found.
+        state: The search with what it has found.
         stage: The model.
         h: Its hypothesis.
-        corrected: Whether its parameters are those of a finer integration (`correct_discretisation_bias`). So
-            are its predictions then: the error of the coarser one would count as a random torque.
+        corrected: Whether its parameters are corrected for the discretisation bias
+            (`correct_discretisation_bias`). Then predictions use the finer integration too, since the error
+            of the coarser integration would count as a random torque.
     """
     problem = state.problem
     if stage.horizon == "prediction" and not corrected:
         return stage
     if stage.horizon == "free_run":
         near = state.current.hypothesis
-        # First states that were fitted: a run from measured ones drifts, which would count as random torque.
+        # First states are fitted ones: runs from measured ones drift, which would count as a random torque.
         fitted = dataclasses.replace(h, x0=near.initial_state_for(problem.supermodel, h.locations))
         h = choose_process_noise(problem, fitted, wide=True)
     finer = finer_integration(problem, h) if corrected else None
@@ -272,14 +273,14 @@ def _rounds(
     remarks: Sequence[Remark],
     stands_in: Mapping[EffectLocation, tuple[str, ...]],
 ) -> tuple[Round, ...]:
-    """What was added, in order, each effect with the stage that it led to.
+    """The rounds of a search: each effect that was added, in order, with the stage that it led to.
 
     Args:
-        state: What was found.
-        stages: Models, each with one effect more.
-        pairs: The last one fitted to different recordings.
-        remarks: On parameters of the last one.
-        stands_in: Signs that effects of an unexplained model stand in for something else.
+        state: The search with what it has found.
+        stages: Models, each with one effect more than the one before.
+        pairs: Estimates of the last model from different recordings.
+        remarks: Remarks on parameters of the last model.
+        stands_in: Effects of an unexplained model -> signs that they stand in for something else.
     """
     mechanism = stages[-1].model.mechanism
     return tuple(
@@ -306,17 +307,17 @@ def _rounds(
 
 
 def stand_ins(state: SearchState) -> dict[EffectLocation, tuple[str, ...]]:
-    """Signs that effects stand in for something else, of the final model at both horizons."""
+    """Effects of the final model -> signs that they stand in for something else, from both horizons."""
     gains = {p: at.gain + at.training_gain for p, (at, _) in state.gains.items()}
     found = signs((state.horizons.prediction, state.horizons.free_run), state.current, gains)
     for bias, reason in _biases_beside_other_faults(state.order).items():
         found[bias] = (*found.get(bias, ()), reason)
-    # One effect in the place of several has the signs of the one whose place in the order it took.
+    # One effect that replaces several gets the signs of the effect whose place in the order it has taken.
     return found | {new: found[old] for new, old in state.in_place_of.items() if old in found}
 
 
 def _biases_beside_other_faults(order: Sequence[EffectLocation]) -> dict[EffectLocation, str]:
-    """Biases of channels that have another fault -> why a part of that one may look like a bias."""
+    """Sensor biases of channels with another fault -> a clause that this fault may look like a bias."""
     apart, found = (SensorBias.name, ChannelDelay.name), {}
     faults = [p for p in order if CATALOG[p.effect].acts_on == "channel" and p.effect not in apart]
     for bias in (p for p in order if p.effect == SensorBias.name):
@@ -328,7 +329,7 @@ def _biases_beside_other_faults(order: Sequence[EffectLocation]) -> dict[EffectL
 
 
 def _gain_of_predictions(state: SearchState, location: EffectLocation, stage: Stage, before: Stage) -> float:
-    """Log-likelihood of predictions that an effect gains on validation data [nat]; NaN if unknown."""
+    """Gain of an effect in log-likelihood of predictions of validation data [nat]; NaN if unknown."""
     if stage.horizon == "prediction":
         return stage.log_likelihood - before.log_likelihood
     if location in state.gains:
@@ -336,13 +337,14 @@ def _gain_of_predictions(state: SearchState, location: EffectLocation, stage: St
     current = state.current
     if location not in current.hypothesis.locations:
         return float("nan")
-    # A calibration of a model whose parameters are those of free runs.
+    # A calibration has no gain from a round. The stages were fitted to free runs, so predictions are
+    # refitted.
     (less,) = refit_without(state.problem, current.hypothesis, [location], alternations=1)
     return current.log_likelihood - validate(state.validation, less, current).log_likelihood
 
 
 def _beyond(remarks: Sequence[Remark], location: EffectLocation) -> tuple[str, ...]:
-    """Which parameters of an effect have values far beyond what the recordings reach."""
+    """Remarks on parameters of an effect with values far beyond what the recordings reach."""
     head = location.name_prefix
     return tuple(r.sentence for r in remarks if r.kind == BEYOND_RECORDINGS and r.parameter.startswith(head))
 
@@ -350,7 +352,7 @@ def _beyond(remarks: Sequence[Remark], location: EffectLocation) -> tuple[str, .
 def _doubts(
     state: SearchState, location: EffectLocation, pairs: Sequence[PairedEstimates]
 ) -> tuple[str, ...]:
-    """Why an effect that is distinguished from others may still stand in for something else, in words."""
+    """Reasons why an effect that is distinguished from others may still stand in for something else."""
     if location not in state.gains:  # a calibration, which other tests have established
         return ()
     reasons = []

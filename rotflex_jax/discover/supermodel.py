@@ -1,8 +1,8 @@
-"""The baseline with every candidate built in and switched off, and the sizes of signals at its ports.
+"""The super-model: the baseline with all candidates built in and switched off; sizes of signals at its ports.
 
-All hypotheses share its numbering of parameters, effects and states. A run has only those of its candidates
-that are switched on: the others would cost most of the time (twenty times the baseline's with all of them),
-and a structure of few effects compiles quickly.
+All hypotheses share the numbering of its parameters, effects and states. A run contains only the candidates
+that are switched on: with all candidates a run would take twenty times as long as the baseline, and a
+structure with few effects compiles quickly.
 """
 
 import dataclasses
@@ -29,7 +29,7 @@ from rotflex_jax.recording import Recording
 
 
 def _known_motion(model: Model, recording: Recording) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Motion of every port: as measured, or as simulated where no sensor determines it."""
+    """Position and speed of every port: as measured, or as simulated where no sensor determines them."""
     measured = motion(model.mechanism, model.measured(recording).astype(float), recording.Ts)
     unmeasured = {port: v for port, v in model.mechanism.port_vectors.items() if port not in measured}
     if not unmeasured:
@@ -43,19 +43,22 @@ def _known_motion(model: Model, recording: Recording) -> dict[str, tuple[np.ndar
 
 
 def stiffness_and_inertia(mechanism: Mechanism, port: str) -> tuple[float, float]:
-    """Stiffness of the linear springs at a port [N m/rad], and the inertia that a torque there meets."""
+    """Stiffness of the linear springs at a port [N m/rad], and the effective inertia there [kg m^2]."""
     stiffness = sum(float(e.stamp().stiffness) for e in mechanism.linear_effects(port))
     p = np.array(mechanism.port_vectors[port])
     return stiffness, float(1 / (p @ inverse_mass(mechanism) @ p))
 
 
 def scales(model: Model, recordings: Sequence[Recording], torque: float) -> dict[str, Scale]:
-    """Port, port with a measured signal, `input` or channel -> size of what moves or drives it.
+    """Sizes of the signals at each place of an effect.
 
     Args:
-        model: Its ports and outputs.
+        model: Gives ports and outputs.
         recordings: Measured data.
         torque: Torque that moves the machine [N m].
+
+    Returns:
+        Place (port, port with a measured signal, `input` or channel) -> sizes of the signals there.
     """
     voltage = max(float(np.max(np.abs(r.u))) for r in recordings)
     mechanism = model.mechanism
@@ -78,7 +81,7 @@ def scales(model: Model, recordings: Sequence[Recording], torque: float) -> dict
 
 
 class EffectLocation(NamedTuple):
-    """Which effect, and at which port (or `input`, or channel) it acts; equal to the plain tuple."""
+    """An effect and the port (or `input`, or channel) at which it acts; equal to the plain tuple."""
 
     effect: str
     port: str
@@ -88,11 +91,11 @@ class EffectLocation(NamedTuple):
 
     @property
     def name_prefix(self) -> str:
-        """What the full names of its parameters begin with."""
+        """The beginning of the full names of its parameters."""
         return name_prefix(self.port, self.effect)
 
     def full_name(self, parameter: str) -> str:
-        """Name of one of its parameters in a mechanism."""
+        """Full name of one of its parameters in a mechanism."""
         return full_name(self.port, self.effect, parameter)
 
     def contains(self, other: "EffectLocation") -> bool:
@@ -105,10 +108,10 @@ class EffectLocation(NamedTuple):
 
 
 class ErrorLine(NamedTuple):
-    """A line in the spectrum of a model's errors that the input has not.
+    """A line in the spectrum of a model's errors that the spectrum of the input does not have.
 
     Attributes:
-        frequency: Where it is [Hz].
+        frequency: Frequency of the line [Hz].
         recording: Index of the recording with these errors.
     """
 
@@ -121,17 +124,19 @@ class Candidate:
     """One effect that may be missing.
 
     Attributes:
-        location: Which effect it is, and where it acts.
+        location: Effect and port.
         effect: Index in the super-model's effects.
         parameters: Indices of its parameters in the super-model's values.
-        probes: Alternatives (shapes), each a list of parameter vectors tried together.
+        probes: Alternatives (shapes), each a list of parameter vectors that are tried together, one direction
+            of the score test per vector.
         amplitudes: For each parameter, whether it is an amplitude.
-        one_sided: Whether a negative amplitude would not be physical.
+        one_sided: Whether negative amplitudes are not physical.
         threshold: Whether a small amplitude does nothing at all, so that only runs at full size show what the
             effect does.
-        line: Which of its parameters is a frequency, tried only where a model's errors have a line; None for
-            other effects.
-        recordings: For each shape of such a candidate the recording whose errors have the line.
+        line: Index of the parameter that is the frequency of a periodic disturbance; it is tried only at
+            lines in the spectrum of a model's errors. None for other effects.
+        recordings: For each shape of a periodic disturbance, the index of the recording whose errors have
+            the line.
     """
 
     location: EffectLocation
@@ -145,7 +150,10 @@ class Candidate:
     recordings: tuple[int, ...] = ()
 
     def at_lines(self, lines: "Sequence[ErrorLine]") -> "Candidate | None":
-        """The candidate as it is tried beside these lines: one shape for each; None without any."""
+        """The candidate with one shape for each line, if it is a periodic disturbance; None without lines.
+
+        Any other candidate is returned unchanged.
+        """
         k = self.line
         if k is None:
             return self
@@ -162,7 +170,7 @@ class ReducedModel:
     """The super-model without some of the effects that are switched off.
 
     Attributes:
-        mechanism: What is left.
+        mechanism: The mechanism that is left.
         effects: Indices of its effects in the super-model.
         parameters: Indices of its parameters in the super-model's values.
         states: Indices of its states in the super-model's state.
@@ -180,12 +188,12 @@ class SuperModel:
 
     Attributes:
         baseline: The user's mechanism.
-        mechanism: With calibrations and candidates.
-        calibrations: Those that were added.
-        candidates: By location.
-        reduced: Reduced models formed so far, by the effects left out.
-        switched: Those of `active`, by what is on.
-        known_gates: Those of `gates`, by what is on.
+        mechanism: The mechanism with calibrations and candidates.
+        calibrations: Calibrations that were added to the baseline.
+        candidates: Location -> candidate.
+        reduced: Cache of reduced models, by the effects that are left out.
+        switched: Cache of `active`, by the effects that are on.
+        known_gates: Cache of `gates`, by the effects that are on.
     """
 
     baseline: Mechanism
@@ -198,12 +206,12 @@ class SuperModel:
 
     @functools.cached_property
     def transform(self) -> Transform:
-        """Between the parameter values and what a fit moves."""
+        """Transform between parameter values and the unconstrained coordinates of a fit."""
         return Transform.of(self.mechanism.parameter_specifications)
 
     @functools.cached_property
     def baseline_states(self) -> list[int]:
-        """Indices of the baseline's states in the state."""
+        """Indices of the baseline's states in the state of the super-model."""
         own, count = own_states(self.mechanism), len(self.baseline.effects)
         moving = range(2 * len(self.baseline.coordinates))
         return sorted([*moving, *(row for i, rows in own.items() if i < count for row in rows)])
@@ -211,13 +219,13 @@ class SuperModel:
     def active(self, gates: Shaped[np.ndarray, "*batch E"]) -> ReducedModel:
         """The super-model without the candidates whose gates are all zero."""
         on = np.any(gates.reshape(-1, gates.shape[-1]) != 0, axis=0)
-        key = on.tobytes()  # asked for at every run
+        key = on.tobytes()  # cached, since every run needs it
         if key not in self.switched:
             self.switched[key] = self.with_family(on, ())
         return self.switched[key]
 
     def with_family(self, gates: Shaped[np.ndarray, " E"], family: Iterable[Candidate]) -> ReducedModel:
-        """The super-model with no other candidates than a family and those whose gate is not zero."""
+        """The super-model with only the candidates of a family and candidates whose gate is not zero."""
         kept = {c.effect for c in family}
         others = (c.effect for c in self.candidates.values() if c.effect not in kept)
         left_out = frozenset(i for i in others if gates[i] == 0)
@@ -226,9 +234,9 @@ class SuperModel:
         return self.reduced[left_out]
 
     def families(self, candidates: Iterable[Candidate]) -> list[list[Candidate]]:
-        """Candidates by what they add to the equations: a memory, a contact, a torque, a changed signal.
+        """Candidates grouped by what they add to the equations: memory, dry contact, torque, changed signal.
 
-        Those with linear states of their own (a lag of a sensor, say) are with the changed signals.
+        Candidates with linear states of their own (a lag of a sensor, for example) are among changed signals.
         """
         own = own_states(self.mechanism)
         found: dict[str, list[Candidate]] = {}
@@ -245,7 +253,7 @@ class SuperModel:
         return self.only(i for i in range(len(self.mechanism.effects)) if i not in left_out)
 
     def only(self, kept: Iterable[int]) -> ReducedModel:
-        """The super-model with some effects alone; their numbers in order."""
+        """The super-model with only some effects, given by their indices in increasing order."""
         kept = tuple(kept)
         effects = tuple(self.mechanism.effects[i] for i in kept)
         trusted = frozenset(
@@ -267,41 +275,41 @@ class SuperModel:
         return [(e.name, e.at) for e in self.mechanism.effects].index(location)
 
     def parameter_indices(self, location: EffectLocation) -> list[int]:
-        """Indices of an effect's parameters in the values."""
+        """Indices of an effect's parameters in the parameter values."""
         head = location.name_prefix
         return [i for i, n in enumerate(self.mechanism.parameter_names) if n.startswith(head)]
 
     @functools.cached_property
     def local(self) -> list[int]:
-        """Parameters that each recording has for itself."""
+        """Indices of the parameters of the calibrations, which have a value for each recording."""
         return [i for location in self.calibrations for i in self.parameter_indices(location)]
 
     @functools.cached_property
     def phased(self) -> frozenset[int]:
-        """Amplitudes of disturbances, which have a phase in each recording that no other one tells."""
+        """Indices of amplitudes of periodic disturbances, whose phase differs between recordings."""
         disturbances = [c for c in self.candidates.values() if c.line is not None]
         return frozenset(i for c in disturbances for k, i in enumerate(c.parameters) if k != c.line)
 
     @functools.cached_property
     def baseline_free(self) -> list[int]:
-        """Free parameters of the baseline."""
+        """Indices of the free parameters of the baseline."""
         names = self.mechanism.parameter_names
         return [names.index(n) for n in self.baseline.free_names]
 
     def without_calibrations(self, locations: Iterable[EffectLocation]) -> frozenset[EffectLocation]:
-        """The effects among some that a search may find."""
+        """The given locations without calibrations: effects that a search may find."""
         return frozenset(locations) - set(self.calibrations)
 
     def other_laws(self, location: EffectLocation) -> list[EffectLocation]:
-        """Candidates at the port of an effect that are laws of the same thing."""
+        """Candidates at the same port that are other laws of the same thing as an effect."""
         law = law_of(location.effect)
         at_port = (p for p in self.candidates if p.port == location.port and p != location)
         return [p for p in at_port if law and law_of(p.effect) == law]
 
     def gates(self, switched_on: Iterable[EffectLocation]) -> Float[np.ndarray, " E"]:
-        """One where an effect is on: those of the baseline and those named; not to be written to."""
+        """Gates of all effects: one for effects of the baseline and given ones, else zero; read-only."""
         on = frozenset(switched_on)
-        if on not in self.known_gates:  # asked for at every run
+        if on not in self.known_gates:  # cached, since every run needs it
             base, effects = len(self.baseline.effects), self.mechanism.effects
             found = np.array([float(i < base or (e.name, e.at) in on) for i, e in enumerate(effects)])
             found.flags.writeable = False
@@ -309,9 +317,9 @@ class SuperModel:
         return self.known_gates[on]
 
     def clean(self, values: Float[np.ndarray, " P"], locations: Iterable[EffectLocation]) -> Mechanism:
-        """The user's mechanism with fitted parameters and the named effects, nothing else.
+        """The user's mechanism with given parameter values, and with only the named effects added.
 
-        It has the signals that its effects take, and no others.
+        It has the signals that its effects use, and no others.
         """
         named = dict(zip(self.mechanism.parameter_names, values.tolist(), strict=True))
         mechanism = self.baseline.with_signals(())
@@ -321,10 +329,10 @@ class SuperModel:
 
 
 def checked_candidates(mechanism: Mechanism, candidates: Any) -> list[tuple[type[Effect], str]]:
-    """Pairs of an effect's class and a place that the mechanism has for it.
+    """Candidates, checked: pairs of an effect's class and a place that the mechanism has for it.
 
     Raises:
-        InputError: Anything else.
+        InputError: If `candidates` holds anything else.
     """
     found = [candidates] if (given := entries(candidates)) is None else list(given)
     for pair in found:
@@ -355,13 +363,14 @@ def build(
 
     Args:
         baseline: The user's mechanism.
-        wanted: Candidates (class, port); those the baseline has, or has no port for, are left out.
-        scales: Port (or `input`, or channel) -> size of its signals.
+        wanted: Candidates (class, port). A candidate that the baseline already has, or has no place for, is
+            left out.
+        scales: Port (or `input`, or channel) -> sizes of its signals.
     """
     present = {(e.name, e.at) for e in baseline.effects}
     mechanism = baseline
     calibrations, candidates = [], {}
-    # Fitted from the start with values for each recording, and reported as found where they are needed.
+    # Calibrations are fitted from the start, with values for each recording, and reported where needed.
     for location in (EffectLocation(*c) for c in usual_calibrations(baseline)):
         cls = CATALOG[location.effect]
         if location not in present and baseline.accepts(cls, location.port):

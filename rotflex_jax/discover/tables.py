@@ -1,4 +1,4 @@
-"""What a card, a terminal and a report list of a search: errors, parameters, outcomes, labels."""
+"""Tables and sentences on a result, for notebook, terminal and report: errors, parameters, outcomes."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -28,7 +28,7 @@ from rotflex_jax.text.numbers import (
 
 @dataclasses.dataclass(frozen=True)
 class ErrorCell:
-    """One error: the number, its multiple of the noise, and how far from the noise it is."""
+    """One error: the number, its multiple of the noise, and its grade."""
 
     value: str
     multiple: str
@@ -36,7 +36,7 @@ class ErrorCell:
 
     @property
     def reached(self) -> bool:
-        """Whether it has reached the noise."""
+        """Whether the error has reached the noise."""
         return self.grade is Grade.NOISE
 
 
@@ -51,9 +51,9 @@ class ErrorRow:
 
 @dataclasses.dataclass(frozen=True)
 class ParameterRow:
-    """One parameter in all stages: (value, interval) each, None where the stage lacks it.
+    """One parameter in all stages: (value, interval) for each stage, None where a stage lacks it.
 
-    `given` are the trusted constants on which the interval of the last stage depends, in words.
+    `given` names the trusted constants on which the interval of the last stage depends, in words.
     """
 
     name: str
@@ -81,8 +81,8 @@ class ErrorTable:
 
     Attributes:
         title: Which recordings, and with which offsets.
-        note: Whether the model was chosen on them.
-        rows: One for each stage.
+        note: Whether the model was chosen on these recordings.
+        rows: One row for each stage.
     """
 
     title: str
@@ -95,7 +95,7 @@ class NamedErrors(NamedTuple):
 
     Attributes:
         title: Which recordings, and with which offsets.
-        note: Whether the model was chosen on them.
+        note: Whether the model was chosen on these recordings.
         errors: Label of a model -> its errors.
     """
 
@@ -105,9 +105,10 @@ class NamedErrors(NamedTuple):
 
 
 def error_lists(discovery: SearchResult) -> list[NamedErrors]:
-    """Errors of every stage on validation and on test data, with and without own offsets; what there is.
+    """Errors of every stage on validation and test data, with and without offsets fitted to each recording.
 
-    The fit to all training and validation recordings has errors on test data alone.
+    Only errors that were computed are listed. The final fit has errors on test data only, since it was fitted
+    to the validation data.
     """
     stages, labels, last = discovery.stages, stage_labels(discovery), discovery.final_fit
     own, own_tested = (
@@ -138,7 +139,7 @@ def error_lists(discovery: SearchResult) -> list[NamedErrors]:
 
 
 def _own_offsets(seconds: float, recordings: Sequence[Recording]) -> str:
-    """Which part of each recording has given its offsets, in words."""
+    """To which part of each recording its offsets were fitted, in words."""
     short, count = sum(r.duration <= seconds for r in recordings), len(recordings)
     if short and short == count:
         return f"offsets fitted to all of it, which is no longer than {seconds:g} s"
@@ -147,7 +148,7 @@ def _own_offsets(seconds: float, recordings: Sequence[Recording]) -> str:
 
 
 def error_tables(discovery: SearchResult) -> tuple[ErrorTable, ...]:
-    """The same as tables for people."""
+    """The errors of `error_lists` as tables, with numbers as people read them."""
     by_channel = channel_units(discovery)
 
     def cells(errors: dict[str, float]) -> tuple[ErrorCell, ...]:
@@ -160,7 +161,7 @@ def error_tables(discovery: SearchResult) -> tuple[ErrorTable, ...]:
 
 
 def final_fit_sentence(discovery: SearchResult) -> str:
-    """How the model to use was fitted, and how well that does; empty where it is that of the last round."""
+    """How the model of the final fit was fitted, with its errors; empty without a final fit."""
     found = discovery.final_fit
     if found is None:
         return ""
@@ -212,22 +213,22 @@ def final_fit_sentence(discovery: SearchResult) -> str:
 
 
 def estimates_in_use(discovery: SearchResult, added: Round) -> dict[str, Estimate | None]:
-    """Parameters of an effect as the model to use has them, by short name; None for one that it lacks."""
+    """Estimates of an effect's parameters in the model to use, by short name; None where it lacks one."""
     known = {e.name: e for e in discovery.estimates}
     return {name: known.get(full_name(added.port, added.effect, name)) for name in added.parameters}
 
 
 def has_moved(found: Estimate, used: Estimate) -> bool:
-    """Whether an estimate is another one in the model to use, by the digits that its interval is worth."""
+    """Whether an estimate differs in the model to use, in the digits that are significant by its interval."""
     return dataclasses.replace(found, value=used.value).texts[0] != found.texts[0]
 
 
 def where_sentence(discovery: SearchResult, recording: Recording | None = None) -> str:
-    """Which recording statements of where a model fails are about.
+    """A sentence that names the recording of the statements on where a model fails.
 
     Args:
         discovery: The result.
-        recording: One of its recordings; that of the baseline's failures if None.
+        recording: One of its recordings; if None, the recording on which the baseline was localised.
     """
     r = recording or longest_with_a_say(discovery.train, discovery.validation)
     fitted = any(r is other for other in discovery.train)
@@ -260,7 +261,7 @@ def _cell(value: float, unit: str, floor: float | None) -> ErrorCell:
 
 
 def noise_row(discovery: SearchResult) -> tuple[str, ...]:
-    """Noise floor of each channel."""
+    """Noise floor of each channel, as text."""
     floor = discovery.noise_floor
     return tuple(
         plain_number(readable(floor[c], unit)[0] if c in floor else None)
@@ -269,14 +270,14 @@ def noise_row(discovery: SearchResult) -> tuple[str, ...]:
 
 
 def channel_headings(discovery: SearchResult) -> tuple[str, ...]:
-    """Each channel with the unit it is read in."""
+    """Each channel with the unit in which people read it."""
     return tuple(f"{c} [{readable(0.0, unit)[1]}]" for c, unit in channel_units(discovery).items())
 
 
 def parameter_rows(discovery: SearchResult) -> tuple[ParameterRow, ...]:
-    """Parameters of the final model, then those of earlier stages that it lacks; held ones last.
+    """Parameters of the final model, then parameters of earlier stages that it lacks; held ones come last.
 
-    The final fit is one stage more, where there is one.
+    If there is a final fit, it is an additional stage.
     """
     stages = [{e.name: e for e in s.estimates} for s in discovery.stages]
     if discovery.final_fit:
@@ -302,19 +303,19 @@ def _meanings(models: Sequence[Model]) -> dict[str, str]:
 
 
 def channel_units(discovery: SearchResult) -> dict[str, str]:
-    """Channel of the model -> its unit."""
+    """Channel of the model -> its unit in the recordings."""
     first = discovery.validation[0]
     return {c: first.unit(c) for c in discovery.baseline.held_out_rmse_windows}
 
 
 def noise_ratios(discovery: SearchResult) -> dict[str, float]:
-    """Held-out error over windows of the final model, in multiples of the noise, by channel."""
+    """Channel -> validation error over windows of the final model, in multiples of the noise."""
     errors = discovery.final.held_out_rmse_windows
     return {c: ratio(v, discovery.noise_floor.get(c)) for c, v in errors.items()}
 
 
 def ambiguous_rounds(discovery: SearchResult) -> list[tuple[str, str]]:
-    """Label of each effect that has equals, and the labels of these."""
+    """Label of each effect that has equivalent effects, and the labels of these effects."""
     return [
         (effect_label(r.effect, r.port), " or ".join(effect_label(*pair) for pair in r.equivalent))
         for r in discovery.rounds
@@ -323,7 +324,7 @@ def ambiguous_rounds(discovery: SearchResult) -> list[tuple[str, str]]:
 
 
 def next_steps(discovery: SearchResult) -> list[str]:
-    """What to do now, in plain words."""
+    """What the user may do next, in sentences."""
     hidden = sum(not r.excited for r in discovery.ranking)
     steps = discovery.verdict.next_steps(ambiguous_rounds(discovery), hidden, len(discovery.ranking))
     if discovery.verdict != Verdict.UNEXPLAINED:
@@ -339,7 +340,7 @@ def next_steps(discovery: SearchResult) -> list[str]:
 
 
 class Outcome(StrEnum):
-    """How a candidate stands at the end of a search."""
+    """Outcome of a candidate at the end of a search."""
 
     FOUND = "found"
     ALIKE = "cannot be distinguished from what was found"

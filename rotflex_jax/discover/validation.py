@@ -1,8 +1,8 @@
 """Hypotheses on validation data: likelihood in blocks, short free runs, the two horizons of a search.
 
-As in `Model.simulate_windows`, positions and speeds come from the first samples of each window. States that
-no sensor measures are given here, and come from a run over the whole recording there. A model of its own
-would be compiled for every candidate.
+As in `Model.simulate_windows`, positions and speeds at the start of a window come from its first samples. For
+states that no sensor measures, values are given here, while `Model.simulate_windows` takes them from a run
+over the whole recording. It is not used here, since it would be compiled anew for every candidate.
 """
 
 import dataclasses
@@ -24,7 +24,7 @@ from rotflex_jax.models.model import Model
 from rotflex_jax.optimise.damped_least_squares import NormalEquations, Rules, minimise_together
 from rotflex_jax.runtime.xla import on_threads
 
-# Of the fit of a window's first state to a few samples, which determine it well: hardly damped.
+# Rules of the fit of a window's first state. A few samples determine it well, so the fit is hardly damped.
 FIRST_STATE_RULES = Rules(enough_share=1e-9, damping=1e-6, least=1e-6)
 MAX_FIRST_STATE_STEPS = 12
 
@@ -43,9 +43,9 @@ class ShortRuns:
     """Free runs over the windows of some recordings.
 
     Attributes:
-        predictor: Runs them.
+        predictor: Computes the runs.
         dataset: The recordings.
-        windows: Where runs start again.
+        windows: Windows at whose beginnings the runs start again.
     """
 
     predictor: BatchedPredictor
@@ -53,13 +53,13 @@ class ShortRuns:
     windows: Windows
 
     def outputs(self, run: ParameterSet, directions: int) -> list[Float[np.ndarray, "_ C"]]:
-        """Outputs of each recording's runs; as measured where a sample does not count.
+        """Outputs of free runs over each recording; as measured where a sample does not count.
 
         Args:
-            run: Parameters; of its first states (R, W, m) positions and speeds are where a fit starts, and
-                the others are kept. Its gain is not used.
-            directions: Of the compiled slopes: as many as fits of this structure have, one per coordinate of
-                a first state at least.
+            run: Parameters and first states (R, W, m). First positions and speeds are fitted, from the values
+                given here; other states keep their values. The gain is not used.
+            directions: Number of directions of the compiled slopes: the number that fits of this structure
+                have, and at least one for each coordinate of a first state.
         """
         run = run._replace(K=np.zeros_like(run.K))
         found = run._replace(x0=self._first_states(run, directions))
@@ -67,7 +67,7 @@ class ShortRuns:
         return [np.asarray(y_hat[r, : recording.N]) for r, recording in enumerate(self.dataset.recordings)]
 
     def _first_states(self, run: ParameterSet, directions: int) -> Float[np.ndarray, "R W m"]:
-        """First states whose positions and speeds suit the first samples of each window best."""
+        """First states whose positions and speeds are fitted to the first samples of each window."""
         size, (R, P) = self.windows.first_states.shape[-1], run.values.shape
         x0_ways = np.eye(directions, run.x0.shape[-1])
         x0_ways[size:] = 0.0
@@ -84,7 +84,7 @@ class ShortRuns:
                 heads = ((J[:size, p.recording, p.samples], e[p.recording, p.samples]) for p in points)
                 return [NormalEquations.of(slopes.reshape(size, -1).T, w.ravel()) for slopes, w in heads]
 
-            # Windows share each run.
+            # One run over each recording serves all of its windows.
             return self.predictor.of_slopes(equations, [started_at(points)], [ways], self.windows.index)[0]
 
         found = minimise_together(
@@ -105,23 +105,23 @@ class ShortRuns:
         return out
 
 
-# Of the fit of first states and calibrations. Most steps are nearly linear, so the damping is small from the
-# start, but not nothing: recordings need not determine every state.
+# Rules of the fit of first states and calibrations. The problem is nearly linear, so the damping is small
+# from the start, but not zero: recordings need not determine every state.
 ADAPTATION_RULES = Rules(enough=0.05, damping=1e-6, least=1e-6, increase=30)
 MAX_ADAPTATION_STEPS = 20
 
 
 @dataclasses.dataclass(frozen=True)
 class ValidatedHypothesis:
-    """A fitted hypothesis on validation data.
+    """A fitted hypothesis, evaluated on validation data.
 
     Attributes:
-        hypothesis: Fitted to the training recordings.
-        blocks: What each half second of the validation recordings says for it; see `Hypothesis`.
-        adapted: The same physics, with first states and calibrations of the validation recordings.
-        window_rmse: Error of short free runs of each channel.
-        location: What it adds to the hypothesis it is compared with.
-        parameter_count: How many parameters that takes.
+        hypothesis: The hypothesis, fitted to the training recordings.
+        blocks: Evidence of each half second of the validation recordings, as in `Hypothesis.blocks`.
+        adapted: The same physics with first states and calibrations of the validation recordings.
+        window_rmse: Root mean square error of short free runs, by channel.
+        location: The effect by which it exceeds the hypothesis that it is compared with.
+        parameter_count: Number of parameters of this effect.
         free_run: The same structure fitted to free runs, with its own parameters.
         folds: Where runs validate each other, the fits without each of them.
     """
@@ -136,12 +136,12 @@ class ValidatedHypothesis:
     folds: tuple[Hypothesis, ...] = ()
 
     def with_trained_calibrations(self, s: SuperModel) -> Hypothesis:
-        """The hypothesis on the validation recordings with calibrations as trained, not as adapted.
+        """The hypothesis on the validation recordings, with the calibrations of the training recordings.
 
-        The phase of a disturbance is never that of another recording: it stays as adapted.
+        The phase of a periodic disturbance keeps its adapted value, since recordings never share it.
 
         Args:
-            s: What it is a hypothesis of.
+            s: The super-model of the hypothesis.
         """
         if self.folds:
             trained = [h.local_z[k] for k, h in enumerate(self.folds)]
@@ -155,20 +155,21 @@ class ValidatedHypothesis:
 
     @property
     def log_likelihood(self) -> float:
-        """Of the validation recordings [nat]."""
+        """Log-likelihood of the validation recordings [nat]."""
         return float(np.sum(self.blocks))
 
 
 @dataclasses.dataclass(frozen=True)
 class ValidationSet:
-    """Recordings that no fit has seen, which decide between hypotheses.
+    """Recordings that no hypothesis is fitted to, and by which hypotheses are compared.
 
     Attributes:
         problem: The likelihood of these recordings.
         window_seconds: Length of the windows of short free runs [s].
         chosen: Indices of the recordings that count; all if empty.
-        folds: Where runs validate each other: for each, the others to fit and itself to validate.
-        built_in: Effects that every model of it has in its equations, switched off where they are not on.
+        folds: Where runs validate each other, one fold for each recording.
+        built_in: Effects that are in the equations of every model of `model_of`, with a gate of zero where
+            they are off.
     """
 
     problem: LikelihoodProblem
@@ -182,7 +183,7 @@ class ValidationSet:
         """Each training recording validates what was fitted to the others.
 
         Args:
-            problem: The training recordings, two at least.
+            problem: Likelihood of the training recordings, of which there are at least two.
             window_seconds: Length of the windows of short free runs [s].
         """
         every = range(len(problem.seen))
@@ -201,7 +202,13 @@ class ValidationSet:
         return self.chosen or tuple(range(len(self.problem.dataset.recordings)))
 
     def model_of(self, h: Hypothesis, locations: Iterable[EffectLocation], recording: int) -> Model:
-        """A model of one recording, with these effects on; all share the super-model's compiled code."""
+        """The model of one recording with some effects on.
+
+        Args:
+            h: Gives the parameter values.
+            locations: Effects that are on.
+            recording: Index of the recording, which may have its own calibrations.
+        """
         s, on = self.problem.supermodel, frozenset(locations)
         gates = s.gates(on)
         reduced = s.active(s.gates(on | self.built_in))
@@ -221,13 +228,13 @@ class ValidationSet:
     def short_run_errors(
         self, h: Hypothesis, locations: Iterable[EffectLocation], inner: Hypothesis | None = None
     ) -> Float[np.ndarray, " C"]:
-        """Root mean square error of short free runs with these effects on.
+        """Root mean square error of short free runs with some effects on.
 
         Args:
             h: Gives the parameters.
-            locations: What is on.
-            inner: Fitted to the free runs over these windows, gives first states that no sensor measures; `h`
-                itself if None.
+            locations: Effects that are on.
+            inner: Hypothesis fitted to free runs over these windows, which gives first values of states that
+                no sensor measures; if None, `h` gives them.
         """
         s, on, first = self.problem.supermodel, tuple(locations), self.short_runs.windows.first_states
         x0 = embed_initial_state(s, on, first)
@@ -239,9 +246,9 @@ class ValidationSet:
         return self.window_rmse([runs[i] for i in self.counted])
 
     def window_rmse(self, runs: Sequence[Float[np.ndarray, "_ C"]]) -> Float[np.ndarray, " C"]:
-        """Root mean square error of short free runs of the recordings that count, without first samples.
+        """Root mean square error of short free runs over the recordings that count, without first samples.
 
-        Infinite where runs diverge.
+        It is infinite where runs diverge.
         """
         dataset = self.problem.dataset
         recordings = [dataset.recordings[i] for i in self.counted]
@@ -251,7 +258,7 @@ class ValidationSet:
 
 
 class Fold(NamedTuple):
-    """One recording that validates what was fitted to the others."""
+    """One recording that validates hypotheses fitted to the others."""
 
     train: LikelihoodProblem
     validation: ValidationSet
@@ -263,12 +270,12 @@ def _cross_validated(
     near: ValidatedHypothesis | None,
     inner: Hypothesis | None,
 ) -> ValidatedHypothesis:
-    """A hypothesis fitted without each recording in turn, on the one that was left out."""
+    """A hypothesis fitted without each recording in turn, and evaluated on the one that was left out."""
     fits, found = [], []
     for fold in validation.folds:
         start = fold.train.with_likelihood(h)
         fitted = refit(fold.train, [start], alternations=1)[0]
-        # What belongs to the run that is left out is not known to this fit.
+        # This fit does not know the calibrations of the recording that is left out: it gets their mean.
         k, own = len(fits), fitted.local_z.copy()
         own[k] = np.delete(own, k, axis=0).mean(axis=0)
         fits.append(dataclasses.replace(fitted, local_z=own))
@@ -289,14 +296,14 @@ def _cross_validated(
 
 
 class _OwnStep(NamedTuple):
-    """How far what belongs to one recording alone has moved: its own parameters and first states."""
+    """How far a fit has moved the local parameters and first states of one recording."""
 
     recording: int
     step: Float[np.ndarray, " O"]
 
 
 def carried_over(problem: LikelihoodProblem, h: Hypothesis) -> Hypothesis:
-    """A trained hypothesis on other recordings: from measured first states, with the mean calibrations."""
+    """A trained hypothesis on other recordings, with measured first states and the mean calibrations."""
     first = problem.windows.first_states
     start = dataclasses.replace(
         h,
@@ -314,19 +321,20 @@ def validate(
     near: ValidatedHypothesis | None = None,
     inner: Hypothesis | None = None,
 ) -> ValidatedHypothesis:
-    """Log-likelihood of validation recordings under a trained hypothesis, in blocks.
+    """Evaluate a trained hypothesis on validation recordings: log-likelihood in blocks, short free runs.
 
-    Physics and process noise are the trained ones. What belongs to one recording alone (first state,
-    calibrations) is fitted to it, by least squares. So is the size of the innovations:
-    where no model is complete, their size in training measures how flexible a model is, and a richer model
-    would be penalised elsewhere for its smaller size, however well it predicts there.
+    Physics and process noise keep their trained values. First state and calibrations, which belong to one
+    recording, are fitted to it by least squares. The covariance of the innovations is estimated on the
+    validation recordings too. Where no model is complete, the covariance of the training recordings measures
+    how flexible a model is: a richer model has a smaller one, and would be penalised for it on other
+    recordings, however well it predicts them.
 
     Args:
         validation: The validation recordings.
         h: Trained hypothesis.
         near: Another validated hypothesis, whose first states may be better to start from: where the sensors
             do not determine a state, different first guesses end in different minima.
-        inner: Fitted to free runs over the same recordings; see `ValidationSet.short_run_errors`.
+        inner: Hypothesis fitted to free runs over the same recordings; see `ValidationSet.short_run_errors`.
     """
     if validation.folds:
         return _cross_validated(validation, h, near, inner)
@@ -351,15 +359,15 @@ def validate(
 def adapted_to_recordings(
     problem: LikelihoodProblem, h: Hypothesis, prior: Float[np.ndarray, " R"] | None = None
 ) -> Hypothesis:
-    """The hypothesis with what belongs to each recording alone fitted to it.
+    """The hypothesis with first states and local parameters fitted to each recording.
 
-    The recordings are independent problems, which share each run.
+    The recordings are independent problems, but one call of the predictor evaluates all of them.
 
     Args:
-        problem: The recordings.
-        h: Where the fit starts.
-        prior: For each recording the weight of the squared unconstrained values of its local parameters,
-            which are in units of their usual size; zero if None.
+        problem: Likelihood of the recordings.
+        h: Hypothesis from which the fit starts.
+        prior: Weight, for each recording, of the sum of squares of its local parameters in unconstrained
+            coordinates, where the unit is their usual size; zero if None.
     """
     seen, first = problem.seen, len(h.free)
     weight = np.zeros(len(h.x0)) if prior is None else prior
@@ -421,11 +429,11 @@ class SearchHorizon:
 
 @dataclasses.dataclass(frozen=True)
 class Horizons:
-    """Both horizons; the same compiled programs serve both, as windows are data.
+    """Both horizons; windows are data of the compiled programs, so the same programs serve both.
 
     Attributes:
-        prediction: Each sample from the ones before it, with the process noise that the data ask for.
-        free_run: From the voltage alone, starting again every few seconds.
+        prediction: Prediction of each sample from the samples before it, with the likeliest process noise.
+        free_run: Simulation from the voltage alone, started again every few seconds.
     """
 
     prediction: SearchHorizon
@@ -435,13 +443,13 @@ class Horizons:
     def of(
         cls, model: Model, train: LikelihoodProblem, validation: LikelihoodProblem | None, seconds: float
     ) -> "Horizons":
-        """Both horizons of predictions.
+        """Both horizons, from the likelihoods of predictions.
 
         Args:
             model: The user's model.
-            train: Predictions of the training recordings.
-            validation: Predictions of the validation recordings; if None, each training recording validates
-                what was fitted to the others.
+            train: Likelihood of predictions of the training recordings.
+            validation: Likelihood of predictions of the validation recordings; if None, each training
+                recording validates what was fitted to the others.
             seconds: Length of a free run [s].
         """
         problems = (train, *([validation] if validation else []))
@@ -460,12 +468,12 @@ class Horizons:
     def validated(
         self, prediction: Hypothesis, free_run: Hypothesis, near: ValidatedHypothesis | None = None
     ) -> ValidatedHypothesis:
-        """One structure, fitted at both horizons, on validation data.
+        """One structure, fitted at both horizons, evaluated on validation data.
 
         Args:
-            prediction: Fitted to predictions.
-            free_run: Fitted to free runs.
-            near: Another structure; see `validate`.
+            prediction: The structure fitted to predictions.
+            free_run: The structure fitted to free runs.
+            near: Another validated structure; see `validate`.
         """
         runs = validate(self.free_run.validation, free_run, near.free_run if near else None)
         found = validate(self.prediction.validation, prediction, near, runs.adapted)
@@ -474,16 +482,16 @@ class Horizons:
     def all_validated(
         self, fits: Sequence[tuple[Hypothesis, Hypothesis]], near: ValidatedHypothesis | None = None
     ) -> list[ValidatedHypothesis]:
-        """Several structures side by side, each by its fits to predictions and to free runs."""
+        """Several structures validated in parallel, each with its fits to predictions and to free runs."""
         return on_threads(lambda fit: self.validated(fit[0], fit[1], near), fits)
 
 
 def as_free_run(problem: LikelihoodProblem, h: Hypothesis) -> Hypothesis:
-    """The parameters of a hypothesis of predictions in free runs from measured first states; not fitted.
+    """A hypothesis of free runs from measured first states with the parameters of one fitted to predictions.
 
     Args:
-        problem: The same recordings as free runs.
-        h: Its parameters.
+        problem: Likelihood of free runs over the same recordings.
+        h: Hypothesis fitted to predictions; nothing is fitted again.
     """
     x0 = embed_initial_state(problem.supermodel, h.locations, problem.windows.first_states)
     no_noise = dict.fromkeys(problem.ports, 0.0)

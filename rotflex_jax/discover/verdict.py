@@ -1,6 +1,6 @@
-"""How good a final model is (what is explained, what remains in units of the noise), and the verdicts.
+"""Assessment of a final model (what it explains, what remains in units of the noise), and the verdicts.
 
-A new verdict is a member here, and a case of the rule in `conclusion.py`.
+A new verdict is a member of `Verdict` and a case of the rule in `conclusion.py`.
 """
 
 import dataclasses
@@ -12,18 +12,18 @@ from typing import Any, NamedTuple
 from rotflex_jax.text.colours import BASELINE, FINAL, FURTHER, INK, MUTED
 from rotflex_jax.text.numbers import json_number, json_numbers, multiple, percent_explained, ratio
 
-# An error of at most this times the sensor noise counts as having reached it.
+# An error below this multiple of the sensor noise counts as having reached the noise.
 NEAR_FLOOR = 1.5
-# Beyond this times the sensor noise much is left.
+# An error from this multiple of the sensor noise on counts as far from the noise.
 FAR_FLOOR = 5.0
-# The model explains the recordings if process torques gain no more than this per measured value of the
-# training recordings [nat], and short runs over validation recordings come as near to the sensor noise as
-# `NEAR_FLOOR` says.
+# The model explains the recordings if process noise gains less than this per measured value of the training
+# recordings [nat], and errors of short runs over validation recordings are below `NEAR_FLOOR` times the
+# noise.
 TORQUE_NATS = 0.03
 
 
 class Grade(StrEnum):
-    """How far an error is from the noise of its sensor."""
+    """Distance of an error from the noise of its sensor."""
 
     NOISE = "noise"
     NEAR = "near"
@@ -31,7 +31,7 @@ class Grade(StrEnum):
 
 
 def grade(times: float) -> Grade | None:
-    """The grade of an error; None where no noise is known.
+    """The grade of an error; None if the noise is not known.
 
     Args:
         times: Error over the standard deviation of the noise.
@@ -46,14 +46,14 @@ def grade(times: float) -> Grade | None:
 
 @dataclasses.dataclass(frozen=True)
 class Assessment:
-    """What the verdict rests on.
+    """Quantities on which the verdict rests.
 
     Attributes:
         explained: Channel -> share of the baseline's squared error that the final model explains [%]; not a
             number where runs of the baseline diverge or have no error.
-        remaining: Channel -> error of short runs that is left, in multiples of the sensor noise.
-        torque_nats: What random torques still gain per measured value of the training recordings [nat]; 0
-            where the model is right.
+        remaining: Channel -> error of short runs that remains, in multiples of the sensor noise.
+        torque_nats: Log-likelihood that random torques still gain per measured value of the training
+            recordings [nat]; near 0 if the model is right.
     """
 
     explained: dict[str, float]
@@ -77,9 +77,10 @@ class Assessment:
 
     @property
     def misfit(self) -> float:
-        """Squared errors of short runs, or what random torques gain, over what the verdict allows of them.
+        """How far the model is from explaining the recordings; 1 if it explains them.
 
-        The largest of these; 1 where the model explains the recordings.
+        It is the largest of these ratios: square of the error of short runs in a channel over its limit, and
+        gain of random torques over its limit. The limits are those of the verdict.
         """
         shares = [(times / NEAR_FLOOR) ** 2 for times in self.remaining.values()]
         shares.append(self.torque_nats / TORQUE_NATS)
@@ -87,13 +88,13 @@ class Assessment:
 
     @property
     def grade(self) -> Grade | None:
-        """That of the channel that is furthest from its noise."""
+        """Grade of the channel that is furthest from its noise."""
         known = [times for times in self.remaining.values() if not math.isnan(times)]
         return grade(max(known)) if known else None
 
     @property
     def criterion(self) -> str:
-        """Which criterion decided, as a clause."""
+        """The criterion that decided, as a clause."""
         unknown = [c for c, times in self.remaining.items() if math.isnan(times)]
         if not self.at_noise:
             if all(times < NEAR_FLOOR for c, times in self.remaining.items() if c not in unknown):
@@ -114,7 +115,7 @@ class Assessment:
 
     @property
     def explained_text(self) -> str:
-        """What is explained of each channel, in words; empty where nothing is."""
+        """Share that is explained of each channel, in words; empty if nothing is explained."""
         listed = [f"{c} {percent_explained(share)}" for c, share in self.explained.items() if share > 0]
         return f"{', '.join(listed)} of the baseline's squared error is explained" if listed else ""
 
@@ -135,11 +136,11 @@ def assess(
     floor: Mapping[str, float],
     nats: float,
 ) -> Assessment:
-    """The end of a search by its errors.
+    """The assessment of a final model by its errors.
 
     Args:
         before: Channel -> error of short runs of the baseline.
-        after: The same of the final model.
+        after: Channel -> error of short runs of the final model.
         floor: Channel -> standard deviation of the sensor noise.
         nats: Log-likelihood per measured value that random torques gain over the final model [nat].
 
@@ -154,7 +155,7 @@ def assess(
 
 
 def in_noise(remaining: Mapping[str, float]) -> str:
-    """What remains, as it stands in a sentence.
+    """Remaining errors in multiples of the noise, as they stand in a sentence.
 
     >>> in_noise({"theta": 1.168, "alpha": 228.6})
     'theta 1.17, alpha 229'
@@ -167,12 +168,12 @@ class Presentation(NamedTuple):
 
     Attributes:
         headline: Title of a report.
-        phrase: What holds for a recording with this verdict, after a count: "3 ...".
+        phrase: Phrase for recordings with this verdict, after their number: "3 ...".
         tone: Class of the style sheet: good, warn or bad.
-        colour: Of its points in a figure.
-        marker: Of its points; distinguishes verdicts without colour.
+        colour: Colour of its points in a figure.
+        marker: Marker of its points, which distinguishes verdicts without colour.
         filled: Whether the marker is filled.
-        advice: What to do next; a text with `{effect}` and `{rivals}` is given for each effect that the
+        advice: What to do next; a text with `{effect}` and `{rivals}` is repeated for each effect that the
             recordings cannot distinguish from others.
     """
 
@@ -186,7 +187,7 @@ class Presentation(NamedTuple):
 
 
 class Verdict(StrEnum):
-    """What a search ended with; the values are those of the JSON."""
+    """The end of a search in one word, which is also the value in JSON."""
 
     FOUND = (
         "found",
@@ -271,7 +272,7 @@ class Verdict(StrEnum):
     shown: Presentation
 
     def __new__(cls, value: str, shown: Presentation) -> "Verdict":
-        """A string of this value that knows how it is shown."""
+        """A string with this value and the way in which it is shown."""
         member = str.__new__(cls, value)
         member._value_ = value
         member.shown = shown
@@ -283,12 +284,12 @@ class Verdict(StrEnum):
         return self.value.replace("_", " ")
 
     def next_steps(self, ambiguous: Sequence[tuple[str, str]], hidden: int, candidates: int) -> list[str]:
-        """What to do now, in plain words.
+        """What the user may do next, in sentences.
 
         Args:
-            ambiguous: Effects that were found, each with those that cannot be distinguished from it.
-            hidden: How many candidates the recordings do not excite.
-            candidates: How many there were.
+            ambiguous: Effects that were found, each with the effects that cannot be distinguished from it.
+            hidden: Number of candidates that the recordings do not excite.
+            candidates: Number of candidates.
         """
         steps = []
         for text in self.shown.advice:

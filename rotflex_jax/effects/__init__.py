@@ -1,4 +1,4 @@
-"""Physical effects. One module holds a family of effects; each is entered in the catalogue by `register`.
+"""Physical effects, one module for each family; `register` enters an effect in the catalogue.
 
 To add one, derive a frozen dataclass from a kind (`base.py`), decorate it with `register`, and
 import it here.

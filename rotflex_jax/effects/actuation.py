@@ -47,12 +47,12 @@ class DeadZone(Actuation):
 
     @classmethod
     def probes(cls, scale: Scale) -> list[list[Probe]]:
-        """Two directions, one on each side."""
+        """Two directions of the score test, one for each side."""
         width = 0.05 * scale.voltage
         return [[{"positive": width, "negative": 0.0}, {"positive": 0.0, "negative": width}]]
 
     def sentence(self) -> str:
-        """In words."""
+        """The effect with its values, in one sentence."""
         return f"voltages between {-self.negative:.3g} V and {self.positive:.3g} V have no effect"
 
 
@@ -64,7 +64,7 @@ class Saturation(Actuation):
         v -> min(max(v, -limit), limit)
 
     Inactive only at an infinite limit, so it has no amplitude; a limit above the largest recorded
-    voltage has no effect. Not for a voltage that was recorded behind the limit.
+    voltage has no effect. Not for a voltage that was recorded after the limit.
 
     Args:
         at: Always `input`.
@@ -87,18 +87,18 @@ class Saturation(Actuation):
 
     @classmethod
     def probes(cls, scale: Scale) -> list[list[Probe]]:
-        """One direction at each of four limits."""
+        """One direction of the score test at each of four limits."""
         return [[{"limit": share * scale.voltage}] for share in (0.9, 0.7, 0.5, 0.3)]
 
     def sentence(self) -> str:
-        """In words."""
+        """The effect with its values, in one sentence."""
         return f"the amplifier gives no more than {self.limit:.3g} V either way"
 
 
 @register
 @dataclasses.dataclass(frozen=True)
 class AmplifierSaturation(Actuation):
-    """An amplifier that gives less and less of a large voltage, without a corner at its limit.
+    """Gradual saturation of the amplifier, without a corner at the limit.
 
         v -> limit tanh(v / limit)
 
@@ -107,7 +107,7 @@ class AmplifierSaturation(Actuation):
 
     Args:
         at: Always `input`.
-        limit: Voltage that it approaches [V].
+        limit: Voltage that the output approaches [V].
 
     Source: H. K. Khalil, Nonlinear Systems, 3rd ed., 2002, section 1.2.7.
     """
@@ -127,11 +127,11 @@ class AmplifierSaturation(Actuation):
 
     @classmethod
     def probes(cls, scale: Scale) -> list[list[Probe]]:
-        """One direction at each of three limits."""
+        """One direction of the score test at each of three limits."""
         return [[{"limit": share * scale.voltage}] for share in (2.4, 1.2, 0.6)]
 
     def sentence(self) -> str:
-        """In words."""
+        """The effect with its values, in one sentence."""
         return f"the amplifier saturates gradually and gives less than {self.limit:.3g} V either way"
 
 
@@ -142,8 +142,8 @@ class VoltageOffset(Actuation):
 
         v -> v + offset
 
-    Without other nonlinearities it is the same as a constant torque at the motor's port, and it
-    drifts: a recording may need an offset of its own.
+    Without other nonlinearities it is equivalent to a constant torque at the motor's port. It drifts, so
+    each recording may need its own offset.
 
     Args:
         at: Always `input`.
@@ -168,11 +168,11 @@ class VoltageOffset(Actuation):
 
     @classmethod
     def probes(cls, scale: Scale) -> list[list[Probe]]:
-        """One direction."""
+        """One direction of the score test."""
         return [[{"offset": 0.05 * scale.voltage}]]
 
     def sentence(self) -> str:
-        """In words."""
+        """The effect with its values, in one sentence."""
         return f"the motor sees {self.offset:+.3g} V more than was commanded"
 
 
@@ -183,11 +183,11 @@ class VoltageDrift(Actuation):
 
         v -> v + rate t
 
-    It needs a constant offset beside it for the initial value. It belongs to a recording rather than to a
-    machine: not for predictions of another run. Time counts from the first sample of the recording that a
-    model is given, so a part of another recording (`split`, `slice`) and a window of a fit
-    (`window_seconds`) start at zero again: fit it to whole recordings, and add `rate * part.start` to the
-    voltage of a later part. Windows of one simulation (`simulate_windows`) share their recording's time.
+    It needs an additional constant offset for the initial value. It belongs to a recording, not to the
+    machine, so it cannot predict another run. Time starts at the first sample of the recording that a model
+    is given. A part of another recording (`split`, `slice`) and a window of a fit (`window_seconds`)
+    therefore start at zero again: fit the drift to whole recordings, and add `rate * part.start` to the
+    voltage of a later part. Windows of one simulation (`simulate_windows`) share the time of their recording.
 
     Args:
         at: Always `input`.
@@ -207,38 +207,38 @@ class VoltageDrift(Actuation):
     rate: float = parameter(0.0, unit="V/s", typical=1e-3, meaning="change of the offset with time")
 
     def drive(self, voltage: Float[Array, " N"], Ts: Period) -> Float[Array, " N"]:
-        """Voltage [V] with the offset, its mean over each sample."""
+        """Voltage [V] with the mean of the offset over each sample."""
         return voltage + self.rate * Ts * (jnp.arange(voltage.shape[0], dtype=voltage.dtype) + 0.5)
 
     @classmethod
     def probes(cls, scale: Scale) -> list[list[Probe]]:
-        """One direction."""
+        """One direction of the score test."""
         return [[{"rate": 1e-3 * scale.voltage}]]
 
     def sentence(self) -> str:
-        """In words."""
+        """The effect with its values, in one sentence."""
         return f"the offset of the voltage drifts by {1e3 * self.rate:+.3g} mV per second"
 
 
 @register
 @dataclasses.dataclass(frozen=True)
 class PeriodicDisturbance(Actuation):
-    """A sine from outside that acts on the motor: ripple of the supply, a fan, an unbalance nearby.
+    """A sinusoidal disturbance that acts on the motor: ripple of the supply, a fan, an unbalance nearby.
 
         v -> v + sine sin(2 pi frequency t) + cosine cos(2 pi frequency t)
 
-    A periodic torque at the motor's port is the same as this voltage times torque constant over resistance.
-    One at another port is not: the two angles then ask for different sizes, and something is left. It
-    belongs to a recording rather than to a machine, and nothing tells its phase in another run: not for
-    predictions of one. Time counts from the first sample of the recording that a model is given, as for a
-    drifting offset.
-    Not for a torque of the angle, which has lines where a machine turns evenly (`cogging`).
+    A periodic torque at the motor's port is equivalent to this voltage times torque constant over resistance.
+    A periodic torque at another port is not: no single amplitude then explains both angles. The disturbance
+    belongs to a recording, not to the machine, and its phase in another run is unknown, so it cannot predict
+    another run. Time starts at the first sample of the recording that a model is given, as for
+    `voltage_drift`. Not for a torque that depends on the angle, which also has spectral lines if a machine
+    turns at constant speed (`cogging`).
 
     Args:
         at: Always `input`.
         sine: Amplitude of the sine that begins with the recording [V].
         cosine: Amplitude of the cosine [V].
-        frequency: [Hz].
+        frequency: Frequency of the disturbance [Hz].
 
     Source: L. Ljung, System Identification, 2nd ed., 1999, section 14.1 (disturbances in the data).
     """
@@ -259,14 +259,14 @@ class PeriodicDisturbance(Actuation):
     frequency: float = parameter(1.0, unit="Hz", lower=1e-3, meaning="frequency")
 
     def drive(self, voltage: Float[Array, " N"], Ts: Period) -> Float[Array, " N"]:
-        """Voltage [V] with the disturbance, its mean over each sample."""
+        """Voltage [V] with the mean of the disturbance over each sample."""
         middle = 2 * jnp.pi * self.frequency * Ts * (jnp.arange(voltage.shape[0], dtype=voltage.dtype) + 0.5)
         wave = self.sine * jnp.sin(middle) + self.cosine * jnp.cos(middle)
         return voltage + jnp.sinc(self.frequency * Ts) * wave
 
     @classmethod
     def probes(cls, scale: Scale) -> list[list[Probe]]:
-        """Two directions, a quarter of a period apart; a search sets the frequency."""
+        """Two directions of the score test, a quarter of a period apart; a search sets the frequency."""
         amplitude = 0.05 * scale.voltage
         return [
             [
@@ -276,14 +276,14 @@ class PeriodicDisturbance(Actuation):
         ]
 
     def sentence(self) -> str:
-        """In words."""
+        """The effect with its values, in one sentence."""
         size = math.hypot(self.sine, self.cosine)
         return f"a disturbance of {self.frequency:.4g} Hz acts on the motor like {size:.3g} V of the input"
 
 
 def _held(mean: Float[Array, " N"], moment: Float[Array, " N"]) -> Float[Array, " N"]:
-    """Voltage to hold over each sample that moves a machine as one with this mean and first moment."""
-    # The first moment, which the mean does not show: a pulse and its opposite one sample later.
+    """Voltage that, held over each sample, moves a machine like a voltage with this mean and first moment."""
+    # A first moment acts like a pulse that is followed by its opposite one sample later.
     return mean - jnp.diff(moment, prepend=0.0)
 
 
@@ -294,7 +294,7 @@ class Delay(Actuation):
 
         v(t) = u(t - time)
 
-    Exact in the mean and in the first moment over each sample, also where the delay is no multiple of the
+    Exact in the mean and in the first moment over each sample, also if the delay is not a multiple of the
     sampling period. Before the recording the command has its first value. Slow inputs cannot
     distinguish it from a first-order lag.
 
@@ -331,7 +331,7 @@ class Delay(Actuation):
         newer = jnp.arange(voltage.shape[0]) - whole.astype(int)
         command = lambda k: voltage[jnp.maximum(k, 0)]  # noqa: E731
         mean = part * command(newer - 1) + (1 - part) * command(newer)
-        # The older one comes first.
+        # The older command comes first within a sample.
         return mean, part * (1 - part) / 2 * (command(newer) - command(newer - 1))
 
     @classmethod
@@ -340,7 +340,7 @@ class Delay(Actuation):
         return [[{"time": 0.0021}], [{"time": 0.0081}]]
 
     def sentence(self) -> str:
-        """In words."""
+        """The effect with its values, in one sentence."""
         return f"the voltage comes {1e3 * self.time:.3g} ms later than its command"
 
 
@@ -383,7 +383,7 @@ class Lag(Actuation):
         slow = self.time / Ts
         fade = jnp.exp(-1 / slow)
         behind = -slow * jnp.expm1(-1 / slow)  # mean of exp(-t / time) over a sample
-        # Its first moment about the middle of the sample.
+        # First moment of exp(-t / time) about the middle of the sample.
         early = slow * (behind - fade) - behind / 2
 
         def sample(v: jax.Array, u: jax.Array) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
@@ -397,5 +397,5 @@ class Lag(Actuation):
         return [[{"time": 0.003}], [{"time": 0.012}]]
 
     def sentence(self) -> str:
-        """In words."""
+        """The effect with its values, in one sentence."""
         return f"the voltage follows its command with a lag of {1e3 * self.time:.3g} ms"

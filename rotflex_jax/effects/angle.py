@@ -17,9 +17,9 @@ class Gravity(Force):
 
         tau = -(sine sin(position) + cosine cos(position))
 
-    Two amplitudes instead of one and an angle, because the zero of the angle is where the recording
-    began. Not where the port travels only a few degrees: the sine is a spring there, the cosine a
-    constant torque.
+    The law has two amplitudes instead of one amplitude and a phase, because the angle is zero where the
+    recording began. Not for a port that travels only a few degrees: there the sine is equivalent to a spring
+    and the cosine to a constant torque.
 
     Args:
         at: Port.
@@ -47,14 +47,14 @@ class Gravity(Force):
 
     @classmethod
     def probes(cls, scale: Scale) -> list[list[Probe]]:
-        """Two directions."""
+        """Two directions of the score test, sine and cosine."""
         torque = 0.1 * scale.torque
         return [[{"sine": torque, "cosine": 0.0}, {"sine": 0.0, "cosine": torque}]]
 
     def sentence(self) -> str:
-        """In words."""
+        """The effect with its values, in one sentence."""
         torque = math.hypot(self.sine, self.cosine)
-        # The torque vanishes and restores where the mass hangs lowest.
+        # Where the mass hangs lowest, the torque is zero and has a restoring slope.
         lowest = math.degrees(math.atan2(-self.cosine, self.sine))
         return (
             f"weight turns the {self.at} with up to {torque:.3g} N m towards its lowest point at "
@@ -65,13 +65,14 @@ class Gravity(Force):
 @register
 @dataclasses.dataclass(frozen=True)
 class Cogging(Force):
-    """Magnets that prefer some angles, a gear or a bearing that is not round.
+    """A torque that repeats with the angle: magnets of the motor, a gear or bearing that is not round.
 
         tau = -(sine sin(periods position) + cosine cos(periods position))
 
-    Two amplitudes instead of one and a phase, because the zero of the angle is where the recording
-    began. Not where the port travels less than about one period: that is a spring or a constant
-    torque. Once per turn is the weight of an unbalanced mass (`gravity`).
+    The law has two amplitudes instead of one amplitude and a phase, because the angle is zero where the
+    recording began. Not for a port that travels less than about one period: there it is equivalent to a
+    spring or a constant torque. A torque that repeats once per turn is the weight of an unbalanced mass
+    (`gravity`).
 
     Args:
         at: Port.
@@ -104,7 +105,7 @@ class Cogging(Force):
 
     @classmethod
     def probes(cls, scale: Scale) -> list[list[Probe]]:
-        """Sine and cosine at each number of periods that the travel can show."""
+        """Sine and cosine for each number of periods that the travel can show."""
         torque = 0.1 * scale.torque
         known = (2, 3, 4, 5, 6, 7, 8, 9, 10, 12, 14, 16, 18, 20, 24)
         counts = [n for n in known if n * scale.position > HALF_A_PERIOD] or known[-1:]
@@ -117,7 +118,7 @@ class Cogging(Force):
         ]
 
     def sentence(self) -> str:
-        """In words."""
+        """The effect with its values, in one sentence."""
         torque = math.hypot(self.sine, self.cosine)
         return (
             f"a torque of up to {torque:.3g} N m at the {self.at} repeats {self.periods:.3g} times per turn"

@@ -1,8 +1,9 @@
-"""What an effect is: its kinds, what it writes into a linear model, and the catalogue.
+"""Base classes of effects: the kinds, the entries of linear effects, and the catalogue.
 
-A new effect is a frozen dataclass that derives from one kind. A kind says by the attributes of `Effect` where
-it acts, which states it has and how a step treats it; the other packages ask these attributes, so that a new
-kind is this file, its step in `mechanism/` and its drawing in `docs/generate/effect_figures.py`.
+A new effect is a frozen dataclass that derives from one kind. The class attributes of a kind, declared in
+`Effect`, state where its effects act, which states they have and how an integration step treats them. The
+other packages read these attributes. So a new kind needs a class in this file, its step in `mechanism/` and
+its drawing in `docs/generate/effect_figures.py`.
 
 Sign: an effect returns the torque that acts *on* the port in its positive direction, except the `limit` of a
 dry friction, which is the (non-negative) level of the torque that opposes sliding.
@@ -26,7 +27,7 @@ from rotflex_jax.parameters import Specification, specifications
 from rotflex_jax.recording.samples import name_and_unit
 
 Scalar = Real[Array, "..."] | Real[np.ndarray, "..."] | float | int
-"""A number of one state, or an array of them for states side by side."""
+"""A number for one state, or an array of numbers for several states at once."""
 Period = float | Float[Array, ""]
 """Sampling period [s]."""
 Probe = Mapping[str, float]
@@ -36,21 +37,21 @@ Domain = Literal["port", "input", "channel", "signal"]
 Beside = Literal["nothing", "other", "states"]
 StatePart = Literal["linear", "rotor", "memory"]
 EffectType = TypeVar("EffectType", bound="Effect")
-# Between a port and the signal that drives an effect there.
+# Separator of a port and the signal that drives an effect there.
 _SIGNAL_MARK = ": "
 
 
 def within(x: Scalar, low: Scalar, high: Scalar) -> Real[Array, "..."]:
-    """`x` held within limits; beyond them its derivative is that of the limit, however large its own.
+    """`x` limited to an interval; outside of it the derivative is the derivative of the limit alone.
 
-    Not `clip`, which splits the derivative between the branches on a limit itself: of a band without a width
-    it would halve the derivative by the width.
+    `clip` is no substitute: exactly at a limit it splits the derivative between the branches. For a band of
+    zero width it would halve the derivative with respect to the width.
     """
     return jnp.where(x < low, low, jnp.where(x > high, high, x))
 
 
 def driven_place(port: str, signal: str) -> str:
-    """The place of an effect that a signal drives at a port.
+    """Place (`Effect.at`) of an effect that a signal drives at a port.
 
     >>> port_and_signal(driven_place("arm", "base [m/s^2]"))
     ('arm', 'base [m/s^2]')
@@ -59,13 +60,13 @@ def driven_place(port: str, signal: str) -> str:
 
 
 def port_and_signal(place: str) -> tuple[str, str]:
-    """Port and signal of such a place; the signal of another one is empty."""
+    """Port and signal of a place; the signal is empty if the place has none."""
     port, _, signal = place.partition(_SIGNAL_MARK)
     return port, signal
 
 
 def name_prefix(port: str, effect: str) -> str:
-    """What the full names of an effect's parameters begin with."""
+    """Beginning of the full names of an effect's parameters."""
     return f"{port}.{effect}."
 
 
@@ -79,7 +80,7 @@ def full_name(port: str, effect: str, parameter: str) -> str:
 
 
 class Stamp(NamedTuple):
-    """What a linear effect writes into the equations of motion at its port `p`.
+    """Entries of a linear effect in the equations of motion, at its port `p`.
 
     `M += inertia p p'`, `D += damping p p'`, `K += stiffness p p'`, torque `drive voltage` at `p`.
     A linear effect with states `z` of its own adds `z' = own z + from_speed p.dq + from_voltage v`
@@ -96,34 +97,35 @@ class Stamp(NamedTuple):
     torque: tuple[Scalar, ...] = ()
 
     def static(self) -> "Stamp":
-        """The same with states of its own at the values that they have at constant speed, as numbers.
+        """The entries as floats, with own states replaced by their values at constant speed and voltage.
 
-        A motor damps its port through its current then.
+        For a motor with inductance, `damping` then contains the braking by the back-EMF.
         """
         damping, drive = float(self.damping), float(self.drive)
         if len(self.own):
-            # Not the inverse: a state that nothing brings back has no such value, and adds nothing.
+            # The pseudoinverse, because a pure integrator has no steady value; it then adds nothing.
             through = np.array(self.torque, float) @ np.linalg.pinv(np.array(self.own, float))
             damping += float(through @ np.array(self.from_speed, float))
             drive -= float(through @ np.array(self.from_voltage, float))
         return Stamp(float(self.inertia), damping, float(self.stiffness), drive)
 
 
-# Phase at the ends of the travel of a port, about its middle [rad], below which a law that repeats with the
-# angle is a spring or a constant torque there.
+# Phase of a torque that repeats with the angle, from the middle to the ends of the travel of a port [rad].
+# Below this value the torque cannot be distinguished from a spring or a constant torque.
 HALF_A_PERIOD = 1.5
 
 
 @dataclasses.dataclass(frozen=True)
 class Scale:
-    """How large the signals of a recording are, so that an effect can propose shapes worth trying.
+    """Sizes of the signals of a recording at one place, from which an effect chooses its probes.
 
     Attributes:
         voltage: Largest |u| [V].
         speed: Root mean square speed of the port [rad/s].
-        position: Largest |position| of the port about its mean [rad].
-        torque: Root mean square torque the motor can be seen to give [N m].
-        stiffness: Of the linear springs at the port [N m/rad].
+        position: Largest |position| of the port about its mean [rad]; for a channel the standard deviation
+            of the output.
+        torque: Torque that the motor gives at the root mean square voltage [N m].
+        stiffness: Stiffness of the linear springs at the port [N m/rad].
         inertia: Inertia that a torque at the port accelerates [kg m^2].
         signal: Root mean square of the signal that acts at the port, in its unit.
     """
@@ -142,12 +144,12 @@ class Effect(abc.ABC):
     """One physical mechanism at one port.
 
     Attributes:
-        at: Port it acts at; `input` for actuation, a channel's name for sensing; for what a measured signal
-            drives the port and the signal, `"arm: acceleration of link 1 [rad/s^2]"`.
+        at: Port at which it acts; `input` for actuation; the name of a channel for sensing; port and signal
+            for an effect that a measured signal drives, as `"arm: acceleration of link 1 [rad/s^2]"`.
 
     Raises:
-        InputError: At the definition of a class with a `name` that lacks a method or declaration which its
-            kind requires; at an instance with a value outside of its bounds.
+        InputError: A class with a `name` is defined without a method or declaration that its kind requires;
+            or an instance is given a value outside of its bounds.
     """
 
     # -- declared by each effect
@@ -155,22 +157,24 @@ class Effect(abc.ABC):
     title: ClassVar[str]
     equation: ClassVar[str]
     ports: ClassVar[tuple[str, ...]] = ("hub", "arm", "joint")
-    # Parameters that are amplitudes: at zero (all of them) the effect is inactive.
+    # Parameters that are amplitudes: the effect is inactive if all of them are zero.
     amplitudes: ClassVar[tuple[str, ...]] = ()
     # Simpler effects that this one contains at special values of its parameters.
     contains: ClassVar[tuple[str, ...]] = ()
-    # What several laws describe, such as dry friction; only a model near the noise can tell these laws apart.
+    # Phenomenon that several laws describe, such as dry friction. Only a model with errors near the noise can
+    # distinguish these laws.
     law_of: ClassVar[str] = ""
-    # Ports a search tries it at by default, by their roles (`mechanism.roles`); none for what a model has
-    # from the start.
+    # Places at which a search tries it by default, by their roles (`mechanism.roles`). Empty for an effect
+    # that is searched only on request, or that a model has from the start.
     searched: ClassVar[tuple[str, ...]] = ()
-    # Its volts are the unit of the input, also where that is no voltage but a current or a goal.
+    # True if volts in its parameters stand for the unit of the input, which may be a current or a goal too.
     volts_of_input: ClassVar[bool] = False
     turning: ClassVar[bool] = False  # a function of an angle: no meaning where a port moves along a line
-    repeats: ClassVar[str] = ""  # its parameter that counts repetitions per turn of the port
+    repeats: ClassVar[str] = ""  # name of its parameter for the number of repetitions per turn of the port
     per_recording: ClassVar[bool] = False  # its parameters belong to a recording, not to the machine
-    # Its frequency [Hz], if it is tried only at lines that the errors of a model have and the input has not.
-    # All recordings share it; its amplitudes have a phase, so no recording tells those of another.
+    # Name of its frequency [Hz], for an effect that is tried only at spectral lines which the errors of a
+    # model have and the input lacks. All recordings share the frequency. The amplitudes contain a phase, so
+    # that each recording has its own.
     line: ClassVar[str] = ""
 
     # -- declared by each kind
@@ -178,21 +182,21 @@ class Effect(abc.ABC):
     kind_meaning: ClassVar[str]  # one sentence for the catalogue
     # What `at` names: a port, the voltage, an output, or a port with a signal that acts there.
     acts_on: ClassVar[Domain] = "port"
-    # Which part of the state holds its own states, `order` of them; None where it has none.
+    # Part of the state that contains the `order` states of the effect; None if it has no states.
     state_part: ClassVar[StatePart | None] = None
     is_linear: ClassVar[bool] = False  # enters the matrices of the equations of motion, by a `stamp`
-    # One step per sample is exact for it, or it takes no part in the step.
+    # True if one step per sample is exact for it, or if it takes no part in the step.
     exact_step: ClassVar[bool] = False
     torque_at_port: ClassVar[bool] = False  # a torque that the step adds to the linear part
     dry_contact: ClassVar[bool] = False  # a torque that the step limits to a level
-    # False where a small amplitude changes nothing: no slope at zero shows the effect.
+    # False if a small amplitude changes nothing: the derivatives at zero amplitude do not show the effect.
     slope_at_zero: ClassVar[bool] = True
-    single: ClassVar[bool] = False  # a mechanism has one of this kind at most
-    # Why a linear model of a mechanism leaves it out; empty where it enters by its slope.
+    single: ClassVar[bool] = False  # a mechanism has at most one effect of this kind
+    # Reason why a linear model of a mechanism omits it, as part of a message; empty if its slope enters.
     not_linearised: ClassVar[str] = ""
 
-    # While a mechanism is traced its numbers are arrays or placeholders: `__post_init__` checks the values,
-    # a checker of annotations at run time would not accept them.
+    # While JAX traces a mechanism, its numbers are arrays or placeholders, which a run-time checker of
+    # annotations would not accept. `__post_init__` checks the values.
     __no_type_check__: ClassVar[bool] = True
 
     at: str
@@ -221,7 +225,7 @@ class Effect(abc.ABC):
         for name, spec in specifications(type(self)).items():
             value = getattr(self, name)
             if value is None and getattr(type(self), name) is None:
-                continue  # an optional part that the instance lacks
+                continue  # an optional part that the instance does not have
             if value is None or isinstance(value, str):
                 raise InputError(
                     f"{kind} was given {name}={value!r}, but it needs a number"
@@ -246,49 +250,49 @@ class Effect(abc.ABC):
 
     @property
     def order(self) -> int:
-        """Number of states of its own."""
+        """Number of states of the effect."""
         return 0
 
     @property
     def follows(self) -> dict[str, str]:
-        """Parameter -> the other one of this effect that it always equals; a fit moves the other one."""
+        """Tied parameter -> parameter of this effect that it always equals; a fit moves only the latter."""
         return {}
 
     @property
     def location(self) -> str:
-        """Where it acts, in words."""
+        """Where the effect acts, in words."""
         at = f"at {self.at}"
         words = {"port": at, "signal": at, "input": "on the voltage", "channel": f"at the sensor {self.at}"}
         return words[self.acts_on]
 
     @property
     def port(self) -> str:
-        """The place where it acts, without the signal that drives it."""
+        """The place where the effect acts, without the signal that drives it."""
         return port_and_signal(self.at)[0] if self.acts_on == "signal" else self.at
 
     @property
     def acts_at_port(self) -> bool:
-        """Whether it acts on the motion of a port, driven by a signal or not."""
+        """Whether the effect acts on the motion of a port, driven by a signal or not."""
         return self.acts_on in ("port", "signal")
 
     @property
     def signal_name(self) -> str:
-        """The signal without its unit; empty for most."""
+        """Name of the signal without its unit; empty for an effect without a signal."""
         return name_and_unit(self.signal)[0]
 
     @property
     def signal_unit(self) -> str:
-        """Unit of the signal, per which its parameters are; empty for most."""
+        """Unit of the signal, to which the parameters refer; empty for an effect without a signal."""
         return name_and_unit(self.signal)[1]
 
     @property
     def signal(self) -> str:
-        """The measured signal that drives it in the place of the voltage; empty for most."""
+        """Measured signal that drives it in place of the voltage; empty for an effect without a signal."""
         return port_and_signal(self.at)[1] if self.acts_on == "signal" else ""
 
     @property
     def name_prefix(self) -> str:
-        """What the full names of its parameters begin with."""
+        """Beginning of the full names of its parameters."""
         return name_prefix(self.at, self.name)
 
     def full_name(self, parameter: str) -> str:
@@ -310,17 +314,17 @@ class Effect(abc.ABC):
 
         Returns:
             Alternatives (different shapes); each a list of parameter sets that are tried together,
-            one direction of the test per set. None for what a model has from the start.
+            one direction of the test per set. Empty for an effect that a model has from the start.
         """
         return []
 
     @classmethod
     def probe_values(cls, scale: Scale) -> tuple[tuple[tuple[float, ...], ...], ...]:
-        """What `probes` gives, checked, as values in the order of `declared`.
+        """The checked result of `probes`, as values in the order of `declared`.
 
         Raises:
-            InputError: It is no list of lists of mappings, or a mapping has not just the declared parameters,
-                each with a finite number.
+            InputError: `probes` does not return a list of lists of mappings, or a mapping does not give a
+                finite number for exactly the declared parameters.
         """
         given, names = cls.probes(scale), tuple(cls.declared())
         right = "[[{" + ", ".join(f"{n!r}: 0.1" for n in names) + "}]], a list of shapes, each a list of sets"
@@ -353,11 +357,11 @@ class Effect(abc.ABC):
 
     @classmethod
     def needs(cls) -> tuple[str, ...]:
-        """What must be where it acts: `motor`, `inertia`; of a sensor `second output`, `position`."""
+        """What it needs where it acts, such as `motor` or `inertia`; a sensor may need a `second output`."""
         return ()
 
     def sentence(self) -> str:
-        """What was found, in words with numbers, for a person."""
+        """The effect with its values as text, for a person."""
         numbers = ", ".join(
             f"{n} {v:.4g} {specifications(self)[n].unit}".rstrip() for n, v in self.values.items()
         )
@@ -384,7 +388,7 @@ class Effect(abc.ABC):
 
 
 class Linear(Effect):
-    """Enters the linear part, which the step integrates exactly."""
+    """An effect in the linear part of the equations, which the step integrates exactly."""
 
     kind_label: ClassVar[str] = "linear"
     kind_meaning: ClassVar[str] = (
@@ -395,11 +399,11 @@ class Linear(Effect):
     exact_step: ClassVar[bool] = True
     # True for an inertia that turns with its port.
     inertial: ClassVar[bool] = False
-    # True for what pulls its port back to zero.
+    # True for a spring, whose torque returns its port to zero.
     elastic: ClassVar[bool] = False
-    # True for what turns voltage into torque at its port.
+    # True for a motor, which converts the input to a torque at its port.
     motor: ClassVar[bool] = False
-    # True for a motor that has a `torque_per_current`, so that its torque says its current.
+    # True for a motor that has a `torque_per_current`, so that its current follows from its torque.
     has_current: ClassVar[bool] = False
     # True for a servo that has a `duty`.
     has_duty: ClassVar[bool] = False
@@ -410,7 +414,7 @@ class Linear(Effect):
 
     @property
     def torque_per_current(self) -> Scalar:
-        """Torque at the port per current of the armature [N m/A], of a motor that has a current."""
+        """Torque at the port per armature current [N m/A], for a motor with `has_current`."""
         raise NotImplementedError
 
 
@@ -420,8 +424,8 @@ class Force(Effect):
     kind_label: ClassVar[str] = "force"
     kind_meaning: ClassVar[str] = "A torque that depends on position, speed or voltage at this moment."
     torque_at_port: ClassVar[bool] = True
-    # The last argument of `force`: the motor's "voltage" [V], or of the "motor" the torque [N m] that its
-    # current gives at the port.
+    # Last argument of `force`: for "voltage" the voltage of the motor [V], for "motor" the torque [N m] that
+    # the current of the motor gives at the port.
     driven_by: ClassVar[Drive] = "voltage"
 
     def __init_subclass__(cls, **given: Any) -> None:
@@ -434,16 +438,16 @@ class Force(Effect):
 
     @abc.abstractmethod
     def force(self, position: Scalar, speed: Scalar, voltage: Scalar) -> Scalar:
-        """Torque [N m] on the port; of what a signal drives, its value stands in the place of the voltage."""
+        """Torque [N m] on the port; for an effect with a signal, `voltage` is the value of the signal."""
 
     @classmethod
     def needs(cls) -> tuple[str, ...]:
-        """A motor where its torque is asked for."""
+        """A motor, if the effect depends on the torque of the motor."""
         return ("motor",) if cls.driven_by == "motor" else ()
 
 
 class DryFriction(Effect):
-    """Set-valued friction: any torque within the level holds the port, sliding meets the level."""
+    """Set-valued friction: a port at rest is held by any torque within the level, sliding meets the level."""
 
     kind_label: ClassVar[str] = "dry friction"
     kind_meaning: ClassVar[str] = (
@@ -452,17 +456,17 @@ class DryFriction(Effect):
     torque_at_port: ClassVar[bool] = True
     dry_contact: ClassVar[bool] = True
     not_linearised: ClassVar[str] = "has no slope at rest"
-    # True where the level is the same at every speed and position: a step need not iterate on it.
+    # True if the level does not depend on speed and position, so that a step need not iterate on it.
     steady: ClassVar[bool] = False
-    # True where it depends on the torque that passes from the motor to the machine: `limit` receives it [N m]
-    # as a fourth argument, positive where the motor pushes forwards. It is the mean of both sides of the
-    # port: of what the motors give and, with its share, of what the rest of the machine takes, dry friction
-    # apart.
+    # True if the level depends on the torque that the port transmits from the motor to the machine. `limit`
+    # receives this torque [N m] as a fourth argument, positive where the motor pushes forwards. It is a
+    # weighted mean of the torque of the motors and the torque that the rest of the machine takes, without dry
+    # friction; the latter has the weight `rest_share`.
     loaded: ClassVar[bool] = False
 
     @property
     def rest_share(self) -> float:
-        """Share of the rest of the machine in the transmitted torque, 0 for that of the motors alone."""
+        """Weight of the rest of the machine in the transmitted torque; 0 for the motors alone."""
         return 0.5
 
     @abc.abstractmethod
@@ -471,27 +475,27 @@ class DryFriction(Effect):
 
     @classmethod
     def needs(cls) -> tuple[str, ...]:
-        """A motor and an inertia between it and the rest, where the transmitted torque is asked for."""
+        """A motor, and an inertia between motor and machine, if the level depends on the torque between."""
         return ("motor", "inertia") if cls.loaded else ()
 
 
 class Memory(Effect):
     """A torque with one state of its own, `dz/dt = flow`.
 
-    Normalise the state so that its flow does not depend on the amplitudes where these are zero: a
-    search sees the torque's slope along them there, `z` as it is.
+    Normalise the state so that its flow does not depend on the amplitudes where these are zero. A search
+    takes the derivative of the torque with respect to the amplitudes there, with `z` unchanged.
     """
 
     kind_label: ClassVar[str] = "with memory"
     kind_meaning: ClassVar[str] = "A torque with a state of its own: it depends on what came before."
     state_part: ClassVar[StatePart | None] = "memory"
     torque_at_port: ClassVar[bool] = True
-    # The last argument of `flow` and `force`: the motor's voltage [V]; of the motors at its port the torque
-    # [N m] or the current [A]; or the duty of the servo there.
+    # Last argument of `flow` and `force`: the voltage [V], the torque [N m] or the current [A] of the motors
+    # at its port, or the duty of the servo there.
     driven_by: ClassVar[Drive] = "voltage"
-    # The quantity of its port that its state is the reading of; empty where no output shows it.
+    # Quantity of its port of which the state is the reading; empty if no output shows the state.
     shows: ClassVar[str] = ""
-    # What the law keeps the state within; a step that would take it beyond ends there.
+    # Bounds within which the law keeps the state. A step that would exceed a bound ends at it.
     limits: ClassVar[tuple[float, float]] = (-math.inf, math.inf)
 
     @property
@@ -513,12 +517,12 @@ class Memory(Effect):
 
     @classmethod
     def needs(cls) -> tuple[str, ...]:
-        """A motor where its torque is asked for."""
+        """A motor, if the effect depends on the torque of the motor."""
         return ("motor",) if cls.driven_by == "motor" else ()
 
 
 class Gear(Effect):
-    """A gear that lets the motor's rotor turn on its own between two stops, where port and rotor are one."""
+    """A gear with play: the motor's rotor turns freely between two stops, and drives the port at a stop."""
 
     kind_label: ClassVar[str] = "gear"
     kind_meaning: ClassVar[str] = "Motor and machine touch only where the teeth do."
@@ -526,36 +530,36 @@ class Gear(Effect):
     slope_at_zero: ClassVar[bool] = False
     single: ClassVar[bool] = True
     not_linearised: ClassVar[str] = "has no slope within the play; the gear is taken as tight"
-    # Steps into which a step is cut, so that contact and separation of elastic teeth are apart; more than one
-    # only for a gear with `teeth`.
+    # Number of parts into which a step is divided, so that contact and separation of elastic teeth fall into
+    # different parts; more than one only for a gear with `teeth`.
     steps: ClassVar[int] = 1
 
     @property
     def order(self) -> int:
-        """Two states, angle and speed of the rotor against the port."""
+        """Two states, angle and speed of the rotor relative to the port."""
         return 2
 
     @abc.abstractmethod
     def stops(self) -> Scalar:
-        """Angle [rad] >= 0 from the middle to each stop; none at zero."""
+        """Angle [rad] >= 0 from the middle of the play to each stop; zero for a gear without play."""
 
     @abc.abstractmethod
     def rotor(self) -> Scalar:
-        """The rotor's part of the inertia that is entered at the port, above 0 and below 1."""
+        """Share of the rotor in the inertia that is declared at the port, above 0 and below 1."""
 
     def teeth(self) -> tuple[Scalar, Scalar] | None:
-        """Stiffness [N m/rad] and damping [N m s/rad] of teeth in contact; None where they are rigid."""
+        """Stiffness [N m/rad] and damping [N m s/rad] of teeth in contact; None for rigid teeth."""
         return None
 
     @classmethod
     def needs(cls) -> tuple[str, ...]:
-        """A motor, and an inertia of which the rotor is split off."""
+        """A motor, and an inertia from which the inertia of the rotor is split off."""
         return ("motor", "inertia")
 
 
 @dataclasses.dataclass(frozen=True)
 class Actuation(Effect):
-    """Voltage to voltage, between the recorded command and the motor."""
+    """An effect on the voltage, between the recorded command and the motor."""
 
     kind_label: ClassVar[str] = "actuation"
     kind_meaning: ClassVar[str] = "What lies between the recorded command and the motor."
@@ -564,16 +568,16 @@ class Actuation(Effect):
     exact_step: ClassVar[bool] = True
     not_linearised: ClassVar[str] = "acts on the voltage before the motor, which is the input here"
     ports: ClassVar[tuple[str, ...]] = ("input",)
-    # Several are applied in this order, from the command to the motor.
+    # Order in which several of these effects are applied, from the command to the motor.
     stage: ClassVar[int] = 0
-    # Whether the voltage changes within a sample, so that `within_samples` says more than `drive`.
+    # Whether the voltage changes within a sample, so that `within_samples` contains more than `drive`.
     changes_within_samples: ClassVar[bool] = False
 
     at: str = "input"
 
     @abc.abstractmethod
     def drive(self, voltage: Float[Array, " N"], Ts: Period) -> Float[Array, " N"]:
-        """The whole sequence (N,) [V] that reaches the motor."""
+        """Voltage at the motor for a whole sequence of commands (N,) [V]."""
 
     def within_samples(
         self, voltage: Float[Array, " N"], Ts: Period
@@ -587,20 +591,21 @@ class Actuation(Effect):
 
 
 class Sensing(Effect):
-    """Output to output: what the sensor of one channel makes of the true value.
+    """An effect on one output: the reading of the sensor of a channel for a true value.
 
-    A sensor with dynamics has an `order` and a `stamp`, as a linear effect at the port of its channel; the
-    stamp gives the port no torque. `measure` receives its states.
+    A sensor with dynamics has an `order` and a `stamp`, like a linear effect at the port of its channel, but
+    the stamp gives the port no torque. `measure` receives the states.
     """
 
     kind_label: ClassVar[str] = "sensing"
     kind_meaning: ClassVar[str] = "What a sensor makes of the true value."
     acts_on: ClassVar[Domain] = "channel"
     exact_step: ClassVar[bool] = True
-    # True for an error that shows only against another sensor.
+    # True for an error that shows only in comparison with another sensor.
     relative: ClassVar[bool] = False
-    # What `measure` receives after the true value: nothing, the true value of another channel (the first of
-    # the others), or the tuple of its own states and the order of the derivative that the channel shows.
+    # Further arguments of `measure` after the true value: none; the true value of another channel (the first
+    # of the others); or the tuple of the sensor's states and the order of the derivative that the channel
+    # shows.
     beside: ClassVar[Beside] = "nothing"
 
     @abc.abstractmethod
@@ -608,16 +613,16 @@ class Sensing(Effect):
         """Reading [unit of the channel] for a true value."""
 
     def largest_reading(self) -> float:
-        """The largest reading, either way, that belongs to one true value [unit of the channel]."""
+        """Largest absolute reading up to which the characteristic has an inverse [unit of the channel]."""
         return math.inf
 
     def stamp(self) -> Stamp:
-        """Equations of its own states; not for a sensor without any."""
+        """Equations of the sensor's own states; empty for a sensor without states."""
         return Stamp()
 
     @classmethod
     def needs(cls) -> tuple[str, ...]:
-        """A second output where its true value is asked for."""
+        """A second output, if `measure` takes the true value of another channel."""
         return ("second output",) if cls.beside == "other" else ()
 
 
@@ -629,7 +634,7 @@ KINDS: tuple[type[Effect], ...] = (DryFriction, Force, Memory, Gear, Linear, Act
 EffectClass = TypeVar("EffectClass", bound=type[Effect])
 
 CATALOG: dict[str, type[Effect]] = {}
-# `law_of` dry friction, which every machine has.
+# Value of `law_of` for the laws of dry friction, which every machine has.
 DRY_FRICTION = "dry friction"
 
 
@@ -643,10 +648,10 @@ def register(effect: EffectClass) -> EffectClass:
         The class, unchanged.
 
     Raises:
-        InputError: Another class has the name already.
+        InputError: Another class already has the name.
     """
     known = CATALOG.setdefault(effect.name, effect)
-    # A module that is run again (a notebook cell, a reload) replaces its own earlier class.
+    # If a module is run again (a notebook cell, a reload), its class replaces the earlier one.
     if (known.__module__, known.__qualname__) != (effect.__module__, effect.__qualname__):
         raise InputError(
             f"The effect name '{effect.name}' is taken by {known.__qualname__}; an effect needs a "

@@ -17,7 +17,7 @@ class Viscous(Linear):
 
         tau = -coefficient speed
 
-    The coefficient has no bound: it adds to the damping of the motor, and is estimated as negative where
+    The coefficient has no bound: it adds to the damping of the motor, and is estimated as negative if
     the trusted back-EMF constant is too large. Not for friction that is as large at low speed as at high
     speed: that is Coulomb friction.
 
@@ -44,11 +44,11 @@ class Viscous(Linear):
 
     @classmethod
     def probes(cls, scale: Scale) -> list[list[Probe]]:
-        """One direction."""
+        """One direction of the score test."""
         return [[{"coefficient": 0.1 * scale.torque / scale.speed}]]
 
     def sentence(self) -> str:
-        """In words."""
+        """The effect with its values, in one sentence."""
         if self.coefficient < 0:
             return (
                 f"the {self.at} is damped less than the rest of the model says, by "
@@ -64,9 +64,9 @@ class ViscousAsymmetric(Force):
 
         tau = -asymmetry |speed|
 
-    With viscous damping `c` beside it, the port meets `c + asymmetry` forwards and `c - asymmetry`
-    backwards: a screw, a worm or a seal. Not for a recording of one speed: there it is equivalent to
-    a constant torque, and a fit without it reports it as one.
+    Together with viscous damping `c` at the port, the damping is `c + asymmetry` forwards and `c - asymmetry`
+    backwards, as in a screw, a worm gear or a seal. Not for a recording at one speed: there it is equivalent
+    to a constant torque, and a fit without this effect reports a constant torque.
 
     Args:
         at: Port.
@@ -93,11 +93,11 @@ class ViscousAsymmetric(Force):
 
     @classmethod
     def probes(cls, scale: Scale) -> list[list[Probe]]:
-        """One direction."""
+        """One direction of the score test."""
         return [[{"asymmetry": 0.1 * scale.torque / scale.speed}]]
 
     def sentence(self) -> str:
-        """In words."""
+        """The effect with its values, in one sentence."""
         way = "forwards" if self.asymmetry >= 0 else "backwards"
         return (
             f"damping at the {self.at} is {2 * abs(self.asymmetry):.3g} N m s/rad stronger {way} than the "
@@ -112,10 +112,10 @@ class QuadraticDrag(Force):
 
         tau = -coefficient speed |speed|
 
-    Not for slow motion: below the speeds of the recording it is negligible beside viscous damping.
+    Not for slow motion: at low speeds it is negligible compared with viscous damping.
 
     Args:
-        at: Port; `arm` for the drag of a paddle, since the air knows the absolute speed.
+        at: Port; `arm` for the drag of a paddle, since drag depends on the absolute speed.
         coefficient: Torque per speed squared [N m s^2/rad^2].
 
     Source: Newton 1687; Rayleigh 1876.
@@ -135,9 +135,9 @@ class QuadraticDrag(Force):
 
     @classmethod
     def probes(cls, scale: Scale) -> list[list[Probe]]:
-        """One direction."""
+        """One direction of the score test."""
         return [[{"coefficient": 0.1 * scale.torque / scale.speed**2}]]
 
     def sentence(self) -> str:
-        """In words."""
+        """The effect with its values, in one sentence."""
         return f"drag slows the {self.at} with the square of its speed, {self.coefficient:.3g} N m at 1 rad/s"

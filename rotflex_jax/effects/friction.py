@@ -43,11 +43,11 @@ class Coulomb(DryFriction):
 
     @classmethod
     def probes(cls, scale: Scale) -> list[list[Probe]]:
-        """One direction."""
+        """One direction of the score test."""
         return [[{"level": 0.1 * scale.torque}]]
 
     def sentence(self) -> str:
-        """In words."""
+        """The effect with its values, in one sentence."""
         return (
             f"the {self.at} meets a constant friction torque of {self.level:.3g} N m whichever way it turns"
         )
@@ -94,12 +94,12 @@ class CoulombAsymmetric(DryFriction):
 
     @classmethod
     def probes(cls, scale: Scale) -> list[list[Probe]]:
-        """Two directions, one for each direction of motion."""
+        """Two directions of the score test, one for each direction of motion."""
         torque = 0.1 * scale.torque
         return [[{"forward": torque, "backward": 0.0}, {"forward": 0.0, "backward": torque}]]
 
     def sentence(self) -> str:
-        """In words."""
+        """The effect with its values, in one sentence."""
         return (
             f"the {self.at} meets a friction torque of {self.forward:.3g} N m turning forwards and "
             f"{self.backward:.3g} N m turning backwards"
@@ -109,7 +109,7 @@ class CoulombAsymmetric(DryFriction):
 @register
 @dataclasses.dataclass(frozen=True)
 class Stribeck(DryFriction):
-    """Friction that falls from a breakaway level to a constant one as the motion picks up.
+    """Friction that falls from a breakaway level to a constant level with increasing speed.
 
         |tau| = level + excess exp(-(v/speed)^2) while sliding, up to level + excess at rest
 
@@ -119,7 +119,7 @@ class Stribeck(DryFriction):
     Args:
         at: Port.
         level: Friction torque at high speed [N m].
-        excess: How much more it is at standstill [N m].
+        excess: Additional friction torque at standstill [N m].
         speed: Speed over which the excess is lost [rad/s].
 
     Source: Stribeck 1902; Bo and Pavelescu 1982 with exponent 2.
@@ -137,7 +137,7 @@ class Stribeck(DryFriction):
 
     level: float = parameter(0.02, unit="N m", lower=0.0, meaning="friction torque at speed")
     excess: float = parameter(0.01, unit="N m", lower=0.0, meaning="additional friction torque at standstill")
-    # A shape has no value at which the effect is absent; the bound keeps the quotient finite.
+    # A shape parameter has no value at which the effect is absent; the bound keeps the quotient finite.
     speed: float = parameter(0.2, unit="rad/s", lower=1e-4, meaning="speed over which the excess is lost")
 
     def limit(self, position: Scalar, speed: Scalar, direction: Scalar) -> Scalar:
@@ -146,7 +146,7 @@ class Stribeck(DryFriction):
 
     @classmethod
     def probes(cls, scale: Scale) -> list[list[Probe]]:
-        """Two directions at each of three speeds."""
+        """Two directions of the score test at each of three speeds."""
         torque = 0.1 * scale.torque
         speeds = [max(share * scale.speed, 1e-3) for share in (0.05, 0.2, 0.6)]
         return [
@@ -158,7 +158,7 @@ class Stribeck(DryFriction):
         ]
 
     def sentence(self) -> str:
-        """In words."""
+        """The effect with its values, in one sentence."""
         return (
             f"friction at the {self.at} falls from {self.level + self.excess:.3g} N m at "
             f"standstill to {self.level:.3g} N m within about {2 * self.speed:.2g} rad/s"
@@ -173,20 +173,21 @@ class LoadFriction(DryFriction):
         |tau| = level + driving |load| while the motor drives,  level + driven |load| while it is driven
 
     At rest any torque up to that level holds the port. `load` is the torque through the gear, taken as the
-    mean of both sides of the port: of what the motor gives and of what the rest of the machine takes. With
-    `of="motor"` it is what the motor gives, so that a machine which turns the gear back while the motor gives
-    nothing meets the level alone. The motor drives where the load has the sign of the motion. A gear with
-    `driven` of 2 or more cannot be turned by its load. Not beside an efficiency of the motor that is free,
-    which does the same while the motor drives.
+    mean of both sides of the port: the torque of the motor, and the torque that the rest of the machine
+    takes. With `of="motor"` it is the torque of the motor alone: a machine that turns the gear back while the
+    motor gives no torque then meets the constant level only. The motor drives if the load has the sign of the
+    speed. A load cannot turn a gear with `driven` of 2 or more. Not together with a free efficiency of the
+    motor, which has the same influence while the motor drives.
 
     Args:
         at: Port of the motor.
         level: Friction torque without load [N m].
         driving: Share of the load while the motor drives.
         driven: Share of the load while the load drives the motor.
-        tied: Whether `driven` is `driving`, whatever is given for it: model M3. For recordings of one weight
-            under a servo, which cannot tell the two from another torque constant.
-        of: Whose torque the load is: "both" sides' on average, or the "motor"'s.
+        tied: Whether `driven` always equals `driving`, whatever value is given for it (model M3). Useful for
+            recordings of a servo with one weight, which cannot distinguish two shares from another torque
+            constant.
+        of: Torque that is the load: the mean torque of "both" sides of the port, or of the "motor" alone.
 
     Source: M. Duclusaud, G. Passault, V. Padois and O. Ly, Extended friction models for the physics
     simulation of servo actuators, 2024, models M3 and M5 (load-dependent and directional friction).
@@ -202,7 +203,7 @@ class LoadFriction(DryFriction):
     ports: ClassVar[tuple[str, ...]] = ("hub",)
     amplitudes: ClassVar[tuple[str, ...]] = ("level", "driving", "driven")
     contains: ClassVar[tuple[str, ...]] = ("coulomb",)
-    # Beside a constant friction it ties with it where the load hardly varies: tried where a user asks for it.
+    # Where the load hardly varies, it cannot be distinguished from constant friction: searched on request.
     searched: ClassVar[tuple[str, ...]] = ()
     loaded: ClassVar[bool] = True
 
@@ -234,12 +235,12 @@ class LoadFriction(DryFriction):
 
     @property
     def follows(self) -> dict[str, str]:
-        """The share of a driven motor follows that of a driving one, where they are tied."""
+        """The share `driven` follows the share `driving`, if they are tied."""
         return {"driven": "driving"} if self.tied else {}
 
     @property
     def rest_share(self) -> float:
-        """How much the load is that of the rest of the machine."""
+        """Weight of the rest of the machine in the load."""
         return 0.0 if self.of == "motor" else 0.5
 
     def limit(self, position: Scalar, speed: Scalar, direction: Scalar, load: Scalar) -> Scalar:
@@ -249,12 +250,12 @@ class LoadFriction(DryFriction):
 
     @classmethod
     def probes(cls, scale: Scale) -> list[list[Probe]]:
-        """Three directions, one for each number."""
+        """Three directions of the score test, one for each parameter."""
         none = {"level": 0.0, "driving": 0.0, "driven": 0.0}
         return [[none | {"level": 0.1 * scale.torque}, none | {"driving": 0.2}, none | {"driven": 0.2}]]
 
     def sentence(self) -> str:
-        """In words."""
+        """The effect with its values, in one sentence."""
         whose = "of the motor" if self.of == "motor" else "through the gear"
         return (
             f"friction at the {self.at} grows with the torque {whose}: from {self.level:.3g} N m by "
@@ -265,19 +266,19 @@ class LoadFriction(DryFriction):
 @register
 @dataclasses.dataclass(frozen=True)
 class GearFriction(DryFriction):
-    """Friction of a gear that loses a share of the torque of its motor.
+    """Friction of a gear that grows in proportion to the torque of the motor.
 
         |tau| = level + share |motor torque|
 
     At rest any torque up to that level holds the port. It is `LoadFriction` of the motor's torque with one
-    share for both directions of power, which is as much as a recording of one load can tell. Where the
-    motor's torque is in phase with the speed it is hardly distinguished from viscous damping or from another
-    torque per volt; a weight or a spring that the motor holds makes the difference.
+    share for both directions of power flow; a recording with one load cannot determine more. If the motor's
+    torque is in phase with the speed, the effect can hardly be distinguished from viscous damping or another
+    torque per volt; a weight or a spring that the motor holds makes it distinguishable.
 
     Args:
         at: Port of the motor.
         level: Friction torque without load [N m].
-        share: Of the motor's torque that is lost.
+        share: Share of the motor's torque that is lost.
 
     Source: M. Duclusaud, G. Passault, V. Padois and O. Ly, Extended friction models for the physics
         simulation of servo actuators, 2024, model M3, by the torque of the motor.
@@ -290,7 +291,7 @@ class GearFriction(DryFriction):
     ports: ClassVar[tuple[str, ...]] = ("hub",)
     amplitudes: ClassVar[tuple[str, ...]] = ("level", "share")
     contains: ClassVar[tuple[str, ...]] = ("coulomb",)
-    # Where only inertias and springs load the motor it is alike with other frictions of the catalogue.
+    # Where only inertias and springs load the motor, the other laws of friction are equivalent to it.
     searched: ClassVar[tuple[str, ...]] = ("loaded",)
     loaded: ClassVar[bool] = True
 
@@ -301,7 +302,7 @@ class GearFriction(DryFriction):
 
     @property
     def rest_share(self) -> float:
-        """The torque is that of the motor alone."""
+        """Zero: the level depends on the torque of the motor alone."""
         return 0.0
 
     def limit(self, position: Scalar, speed: Scalar, direction: Scalar, load: Scalar) -> Scalar:
@@ -310,11 +311,11 @@ class GearFriction(DryFriction):
 
     @classmethod
     def probes(cls, scale: Scale) -> list[list[Probe]]:
-        """Two directions, one for each parameter."""
+        """Two directions of the score test, one for each parameter."""
         return [[{"level": 0.1 * scale.torque, "share": 0.0}, {"level": 0.0, "share": 0.2}]]
 
     def sentence(self) -> str:
-        """In words."""
+        """The effect with its values, in one sentence."""
         return (
             f"friction at the {self.at} is {self.share:.1%} of the torque of the motor, "
             f"and {self.level:.3g} N m besides"

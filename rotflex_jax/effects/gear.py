@@ -17,16 +17,16 @@ class Backlash(Gear):
 
     `r` is the angle of the rotor relative to the port, referred to the port, and `tau` the transmitted
     torque. The rotor has a `share` of the inertia that is entered at the port; the motor with its back-EMF
-    acts on it, all other effects at the port on the rest. What the motor's own shaft meets stands at the port
-    `rotor`, which a mechanism with this gear has besides its own. The impact of the teeth is inelastic.
-    Not for a spring that is loose about its rest position, which is `joint_play`, nor for play that is
-    never crossed, which shifts the angle only. Beside `heating` and `torque_saturation` the lost torque acts
-    on the port even while the rotor is in flight.
+    acts on the rotor, all other effects at the port act on the rest. Effects on the motor shaft itself are
+    entered at the port `rotor`, which a mechanism with this gear has in addition to its own ports. The impact
+    of the teeth is inelastic. Not for a spring that is loose about its rest position, which is `joint_play`,
+    nor for play that is never crossed, which only shifts the angle. Together with `heating` and
+    `torque_saturation`, the lost torque acts on the port even while the teeth are out of contact.
 
     Args:
         at: Port of the motor.
-        gap: Half of the play [rad], as the port sees it.
-        share: The rotor's part of the port's inertia.
+        gap: Half of the play [rad], referred to the port.
+        share: Share of the rotor in the inertia of the port.
 
     Source: M. Nordin and P.-O. Gutman, Controlling mechanical systems with backlash, Automatica 38,
     2002; F. Pfeiffer and C. Glocker, Multibody Dynamics with Unilateral Contacts, 1996, chapter 6.
@@ -49,23 +49,23 @@ class Backlash(Gear):
     )
 
     def stops(self) -> Scalar:
-        """Angle [rad] from the middle to each stop."""
+        """Angle [rad] from the middle of the play to each stop."""
         return self.gap
 
     def rotor(self) -> Scalar:
-        """The rotor's part of the inertia at the port."""
+        """Share of the rotor in the inertia at the port."""
         return self.share
 
     @classmethod
     def probes(cls, scale: Scale) -> list[list[Probe]]:
-        """Gaps in steps of two, those that the motor's torque crosses in 3 to 34 ms, each an alternative."""
+        """Gaps that differ by factors of two, each an alternative; the motor crosses them in 3 to 34 ms."""
         times = [0.012 * 2 ** (k / 2) for k in (0, 1, -1, 2, -2, 3, -3, -4)]
         if not scale.inertia:
             return []
         return [[{"gap": scale.torque / scale.inertia * t * t / 4, "share": 0.6}] for t in times]
 
     def sentence(self) -> str:
-        """In words."""
+        """The effect with its values, in one sentence."""
         return (
             f"the gear at the {self.at} has a play of {math.degrees(2 * self.gap):.3g} deg in all, which the "
             f"rotor with {100 * self.share:.0f} % of the inertia there crosses alone"
@@ -75,24 +75,23 @@ class Backlash(Gear):
 @register
 @dataclasses.dataclass(frozen=True)
 class ElasticBacklash(Gear):
-    """Play of a gear whose teeth give: beyond the play they push like a spring with damping, and never pull.
+    """Play of a gear with elastic teeth: beyond the play they push like a damped spring, and never pull.
 
         tau = max(0, stiffness depth + damping depth') sign(r),   depth = |r| - gap > 0,   0 within the play
 
     `r` is the angle of the rotor relative to the port, referred to the port, and `tau` the torque on the
-    port. The rotor has a `share` of the inertia that is entered at the port; the motor with its back-EMF
-    acts on it with all that stands at the port `rotor`, all other effects at the port on the rest. Without a
-    gap it is a gear that is elastic only.
-    Not where the teeth swing far above the sampling frequency: that is `backlash`, its limit, without the
-    two parameters that no recording shows then. A search tries it on request and in the place of
-    `backlash`, since a machine has one gear.
+    port. The rotor has a `share` of the inertia that is entered at the port. The motor with its back-EMF and
+    all effects at the port `rotor` act on the rotor, all other effects at the port act on the rest. Without a
+    gap it is a gear with elasticity only. Not for teeth that oscillate far above the sampling frequency: use
+    the limit of rigid teeth, `backlash`, without the two parameters that no recording then shows. A search
+    tries this effect on request and in place of `backlash`, since a machine has one gear.
 
     Args:
         at: Port of the motor.
-        gap: Half of the play [rad], as the port sees it.
-        share: The rotor's part of the port's inertia.
-        stiffness: Of teeth in contact [N m/rad].
-        damping: Of teeth in contact [N m s/rad].
+        gap: Half of the play [rad], referred to the port.
+        share: Share of the rotor in the inertia of the port.
+        stiffness: Stiffness of teeth in contact [N m/rad].
+        damping: Damping of teeth in contact [N m s/rad].
 
     Source: M. Nordin and P.-O. Gutman, Controlling mechanical systems with backlash, Automatica 38, 2002,
     section 2 (dead zone model with damping); K. H. Hunt and F. R. E. Crossley, J. Applied Mechanics 42, 1975,
@@ -118,11 +117,11 @@ class ElasticBacklash(Gear):
     damping: float = parameter(0.3, unit="N m s/rad", lower=0.0, meaning="of teeth in contact")
 
     def stops(self) -> Scalar:
-        """Angle [rad] from the middle to where the teeth touch."""
+        """Angle [rad] from the middle of the play to where the teeth touch."""
         return self.gap
 
     def rotor(self) -> Scalar:
-        """The rotor's part of the inertia at the port."""
+        """Share of the rotor in the inertia at the port."""
         return self.share
 
     def teeth(self) -> tuple[Scalar, Scalar]:
@@ -131,7 +130,7 @@ class ElasticBacklash(Gear):
 
     @classmethod
     def probes(cls, scale: Scale) -> list[list[Probe]]:
-        """Gaps in steps of two as for rigid teeth, each an alternative."""
+        """Gaps that differ by factors of two, as for rigid teeth, each an alternative."""
         if not scale.inertia:
             return []
         teeth = {"share": 0.6, "stiffness": 1500.0, "damping": 0.3}
@@ -139,7 +138,7 @@ class ElasticBacklash(Gear):
         return [[{"gap": gap, **teeth}] for gap in gaps]
 
     def sentence(self) -> str:
-        """In words."""
+        """The effect with its values, in one sentence."""
         return (
             f"the gear at the {self.at} has a play of {math.degrees(2 * self.gap):.3g} deg in all, which the "
             f"rotor with {100 * self.share:.0f} % of the inertia there crosses alone, and teeth of "

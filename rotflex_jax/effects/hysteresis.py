@@ -17,8 +17,8 @@ class Dahl(Memory):
 
         dz/dt = speed/presliding - |speed|/presliding z,    tau = -level z
 
-    Not for a recording in which the presliding is smaller than the sensor resolves: it is Coulomb
-    friction there, and simpler. It has no breakaway level and creeps under a vibrating load.
+    Not for a recording in which the presliding is below the resolution of the sensor: there it is equivalent
+    to Coulomb friction, which is simpler. It has no breakaway level and creeps under a vibrating load.
 
     Args:
         at: Port.
@@ -37,7 +37,7 @@ class Dahl(Memory):
     searched: ClassVar[tuple[str, ...]] = ("hub", "joint")
 
     level: float = parameter(0.02, unit="N m", lower=0.0, meaning="friction torque when it slides")
-    # Coulomb friction is the limit of none at all; the bound keeps the rate finite.
+    # The limit of zero presliding is Coulomb friction; the bound keeps the rate finite.
     presliding: float = parameter(
         0.003, unit="rad", lower=1e-6, meaning="displacement over which it builds up"
     )
@@ -53,12 +53,12 @@ class Dahl(Memory):
 
     @classmethod
     def probes(cls, scale: Scale) -> list[list[Probe]]:
-        """One direction at each of three displacements."""
+        """One direction of the score test at each of three displacements."""
         torque = 0.1 * scale.torque
         return [[{"level": torque, "presliding": size}] for size in (0.001, 0.003, 0.01)]
 
     def sentence(self) -> str:
-        """In words."""
+        """The effect with its values, in one sentence."""
         return (
             f"the {self.at} meets a friction torque of {self.level:.3g} N m that builds up over "
             f"{self.presliding:.2g} rad ({math.degrees(self.presliding):.2g} degrees) after each "
@@ -76,21 +76,21 @@ class LuGre(Memory):
         tau = -(level z + damping exp(-(speed/slow)^2) presliding dz/dt)
 
     In the usual symbols `level` is Fc, `level rise` is Fs - Fc, `level / presliding` is sigma0 and
-    `damping` is sigma1; sigma2 is viscous damping, which has an effect of its own. Not for a
-    recording in which the presliding is smaller than the sensor resolves: there it is Stribeck
-    friction, and simpler. Over the speed `slow` both the rise and the damping of the bristles are lost: at
-    `slow` a share exp(-1) of each is left. A constant damping gives energy at speeds where
-    `damping |speed|` exceeds `4 level g`, and a fit to a machine that moves fast takes it for a damping of
-    impacts. With this one no speed gives energy where `damping slow` is below `9 level`; a fitted value
-    above that needs a check.
+    `damping` is sigma1; sigma2 is viscous damping, which is a separate effect. Not for a recording in which
+    the presliding is below the resolution of the sensor: there it is equivalent to Stribeck friction, which
+    is simpler. Both the rise and the damping of the bristles decrease with the speed: at `slow` a share
+    exp(-1) of each is left. With a constant damping, friction would generate energy at speeds where
+    `damping |speed|` exceeds `4 level g`, and a fit to a fast machine would use this damping to describe
+    impacts. With the damping used here, friction generates energy at no speed if `damping slow` is below
+    `9 level`; check a larger fitted value.
 
     Args:
         at: Port.
         level: Friction torque when it slides fast [N m].
-        rise: Breakaway level over `level`, less one.
+        rise: Breakaway level divided by `level`, minus one.
         slow: Speed over which the rise and the damping of the bristles are lost [rad/s].
         presliding: Displacement over which the torque builds up [rad].
-        damping: Of the bristles, at rest [N m s/rad].
+        damping: Damping of the bristles at rest [N m s/rad].
 
     Source: Canudas de Wit, Olsson, Åström and Lischinsky, IEEE Trans. Automatic Control 40, 1995,
     equations 1 to 4; damping that falls with the speed: Åström and Canudas de Wit, IEEE Control Systems
@@ -109,7 +109,7 @@ class LuGre(Memory):
     searched: ClassVar[tuple[str, ...]] = ("hub", "joint")
 
     level: float = parameter(0.02, unit="N m", lower=0.0, meaning="friction torque when it slides fast")
-    # Where it hardly slides at all (a large rise, a small level), only their product shows.
+    # Where the port hardly slides (large rise, small level), only the product of rise and level shows.
     rise: float = parameter(0.5, unit="", lower=0.0, upper=10.0, meaning="breakaway level over it, less one")
     slow: float = parameter(
         0.3,
@@ -117,7 +117,7 @@ class LuGre(Memory):
         lower=1e-3,
         meaning="speed over which the rise and the damping of the bristles are lost",
     )
-    # Stribeck friction is the limit of none at all; the bound keeps the rate finite.
+    # The limit of zero presliding is Stribeck friction; the bound keeps the rate finite.
     presliding: float = parameter(
         0.003, unit="rad", lower=1e-6, meaning="displacement over which it builds up"
     )
@@ -134,19 +134,19 @@ class LuGre(Memory):
         return -(self.level * z + self.damping * self._fading(speed) * bending)
 
     def _fading(self, speed: Scalar) -> Scalar:
-        """What is left at this speed of all that belongs to slow motion [-]."""
+        """Factor by which the rise and the damping of the bristles are reduced at this speed [-]."""
         return jnp.exp(-((speed / self.slow) ** 2))
 
     @classmethod
     def probes(cls, scale: Scale) -> list[list[Probe]]:
-        """Friction and damping of the bristles, at each of two displacements."""
+        """Two directions, friction and damping of the bristles, at each of two displacements."""
         torque, slow = 0.1 * scale.torque, 0.15 * scale.speed + 1e-3
         friction = {"level": torque, "damping": 0.0, "rise": 0.5, "slow": slow}
         bristles = friction | {"level": 0.0, "damping": 0.3 * torque / slow}
         return [[a | {"presliding": size} for a in (friction, bristles)] for size in (0.001, 0.005)]
 
     def sentence(self) -> str:
-        """In words: the friction, the damping of the bristles, or both, as far as they show."""
+        """A sentence about the friction, the damping of the bristles or both, without a negligible one."""
         within = f"{self.presliding:.2g} rad ({math.degrees(self.presliding):.2g} degrees)"
         breakaway, bristles = self.level * (1 + self.rise), self.damping * self.slow  # torques [N m]
         damps = f"damps motion below {self.slow:.2g} rad/s by {self.damping:.3g} N m s/rad"
@@ -170,13 +170,13 @@ class BoucWen(Memory):
     saturates without loss. A recording without small reversals cannot distinguish it from Dahl friction:
     the two differ only where the motion reverses before the state has saturated.
 
-    With a `beta` of less than a half the state moves ever faster after a reversal, until it changes its sign.
-    A step that takes the law as linear would throw it far beyond 1, so it is held within its limits.
+    With `beta` below one half, the state accelerates after a reversal until it changes its sign. A step that
+    linearises the law could move the state far beyond 1, so the state is limited to its range.
 
     Args:
         at: Port.
         level: Torque at saturation [N m].
-        width: Deflection over which it builds up [rad].
+        width: Deflection over which the torque builds up [rad].
         beta: Share of the hysteretic part.
 
     Source: R. Bouc 1967; Y.-K. Wen, J. Eng. Mech. Div. 102, 1976, with exponent 1.
@@ -208,13 +208,13 @@ class BoucWen(Memory):
 
     @classmethod
     def probes(cls, scale: Scale) -> list[list[Probe]]:
-        """One direction at each of two widths."""
+        """One direction of the score test at each of two widths."""
         torque = 0.1 * scale.torque
         widths = (0.1 * scale.position, 0.4 * scale.position)
         return [[{"level": torque, "width": width, "beta": 0.5}] for width in widths]
 
     def sentence(self) -> str:
-        """In words."""
+        """The effect with its values, in one sentence."""
         return (
             f"the {self.at} has a hysteretic torque of up to {self.level:.3g} N m that builds up over "
             f"{self.width:.2g} rad ({math.degrees(self.width):.2g} degrees) after each reversal"

@@ -1,4 +1,4 @@
-"""Inertia: a moment of inertia, and a part with a mode of vibration of its own."""
+"""Inertia: a moment of inertia, and an elastically attached part with its own mode of vibration."""
 
 import dataclasses
 import math
@@ -38,12 +38,12 @@ class Inertia(Linear):
 
     @classmethod
     def probes(cls, scale: Scale) -> list[list[Probe]]:
-        """One direction."""
+        """One direction of the score test."""
         acceleration = scale.speed**2 / scale.position
         return [[{"inertia": 0.1 * scale.torque / acceleration}]]
 
     def sentence(self) -> str:
-        """In words."""
+        """The effect with its values, in one sentence."""
         return f"the {self.at} carries a moment of inertia of {self.inertia:.3g} kg m^2"
 
 
@@ -55,13 +55,13 @@ class SecondMode(Linear):
         r'' + 2 damping W (r' - p.dq) + W^2 (r - p.q) = 0,    W = 2 pi frequency
         tau = -inertia r''
 
-    Not where the frequency lies above what the input excites: the part moves with the port there,
-    and its inertia is only added to the port's.
+    Not for a frequency above the excited band: the part then moves with the port, and its inertia only
+    adds to the inertia at the port.
 
     Args:
         at: Port.
-        inertia: Of the part [kg m^2].
-        frequency: Of the part while the port is held [Hz].
+        inertia: Inertia of the part [kg m^2].
+        frequency: Natural frequency of the part while the port is held [Hz].
         damping: Damping ratio of the part.
 
     Source: J. P. Den Hartog, Mechanical Vibrations, 4th ed., 1956, section 3.2.
@@ -82,7 +82,7 @@ class SecondMode(Linear):
 
     @property
     def order(self) -> int:
-        """Two states: the part's angle from the port, and its own speed."""
+        """Two states: the angle of the part relative to the port, and the absolute speed of the part."""
         return 2
 
     def stamp(self) -> Stamp:
@@ -99,7 +99,7 @@ class SecondMode(Linear):
 
     @classmethod
     def probes(cls, scale: Scale) -> list[list[Probe]]:
-        """One direction at each of several frequencies."""
+        """One direction of the score test at each of several frequencies."""
         return (
             [
                 [{"inertia": 0.05 * scale.inertia, "frequency": f, "damping": 0.05}]
@@ -110,7 +110,7 @@ class SecondMode(Linear):
         )
 
     def sentence(self) -> str:
-        """In words."""
+        """The effect with its values, in one sentence."""
         return (
             f"a part of {self.inertia:.3g} kg m^2 at the {self.at} swings on its own at "
             f"{self.frequency:.3g} Hz with a damping ratio of {self.damping:.2g}"

@@ -1,4 +1,4 @@
-"""Effects as people read them: the noun of the field and where it acts, and sentences that mention them."""
+"""Names of effects for people: nouns with the place of action, and sentences that mention effects."""
 
 import re
 
@@ -8,7 +8,7 @@ from rotflex_jax.text.numbers import together
 
 
 def effect_label(effect: str, port: str) -> str:
-    """An effect and its port, short; a sensor error is one of its channel, and the input is one.
+    """Short label of an effect with its port or channel; an effect on the input is named without a place.
 
     >>> effect_label("cubic_spring", "joint"), effect_label("sensor_bias", "alpha")
     ('cubic spring at joint', 'sensor bias of alpha')
@@ -19,7 +19,7 @@ def effect_label(effect: str, port: str) -> str:
 
 
 def effect_phrase(effect: str, port: str) -> str:
-    """The same within a sentence.
+    """Name of an effect with its port or channel, for use within a sentence.
 
     >>> effect_phrase("coulomb", "hub"), effect_phrase("sensor_bias", "alpha")
     ('Coulomb friction at the hub', 'sensor bias of alpha')
@@ -28,7 +28,9 @@ def effect_phrase(effect: str, port: str) -> str:
 
 
 def law_phrase(effect: str, port: str) -> str:
-    """What an effect is a law of, with its port, within a sentence; empty where no other law describes it.
+    """The phenomenon of which an effect is a law, with its port, for use within a sentence.
+
+    The text is empty if no other law describes the phenomenon.
 
     >>> law_phrase("stribeck", "hub"), law_phrase("lag", "input"), law_phrase("saturation", "input")
     ('dry friction at the hub', 'late input', '')
@@ -38,7 +40,7 @@ def law_phrase(effect: str, port: str) -> str:
 
 
 def law_of(effect: str) -> str:
-    """What an effect is a law of, beside others; empty where it is the only one."""
+    """The phenomenon that an effect and other laws describe, as dry friction; empty without other laws."""
     known = CATALOG.get(effect)
     return known.law_of if known else ""
 
@@ -56,17 +58,17 @@ def _placed(effect: str, port: str, article: str, noun: str = "") -> str:
 
 
 def effect_title(effect: str) -> str:
-    """What an effect is, as a noun; its name where the catalogue lacks it."""
+    """Noun for an effect; its name with spaces if the catalogue lacks it."""
     known = CATALOG.get(effect)
     return known.title if known else effect.replace("_", " ")
 
 
-# What may stand before a name in a list of effects; after any other word, "spring" or "delay" is that word.
+# What may precede the name of an effect in a list. After any other word, "spring" or "delay" is a usual word.
 _BEFORE_A_NAME = re.compile(r"(?:^|[^\w\s]\s*|\b(?:and|or|from|refitting|scoring)\s)$")
 
 
 def with_titles(text: str) -> str:
-    """A text in which effects are named by their nouns, in the place of the names that scripts use.
+    """A text in which nouns replace the names of effects that scripts use.
 
     >>> with_titles("+ coulomb at hub"), with_titles("lugre at the hub and delay at the input")
     ('+ Coulomb friction at hub', 'LuGre friction at the hub and input delay')
@@ -83,7 +85,7 @@ def with_titles(text: str) -> str:
 
 
 def sentence(text: str) -> str:
-    """A text as a sentence in print: capital letter, full stop, nouns of effects, units kept together.
+    """A text as a printed sentence: capital letter, full stop, titles of effects, units next to numbers.
 
     >>> sentence("cubic_spring explains it")
     'Cubic spring explains it.'

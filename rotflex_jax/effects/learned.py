@@ -1,4 +1,4 @@
-"""A torque that was learned: a smooth map of position and speed, with no physics in it."""
+"""A learned torque: a smooth function of position and speed, without a physical law."""
 
 import dataclasses
 import math
@@ -27,7 +27,7 @@ class LearnedTorque(Force):
     The speed is transformed so that the splines are dense where friction changes sign and wide
     elsewhere. Outside of its ranges the map is constant. The splines of one axis add up to one.
 
-    An effect with a formula has fewer parameters: use this where no effect of the catalogue explains the
+    An effect with a formula has fewer parameters: use this one if no effect of the catalogue explains the
     recording, and interpret it (`rf.learn_torque`). Not for a torque that depends on time or on the past, and
     not for friction that holds a port at rest: the map is smooth, so the port creeps.
 
@@ -36,9 +36,9 @@ class LearnedTorque(Force):
         position: Range of positions [rad].
         speed: Range of speeds [rad/s].
         bend: Speed below which the transformation is linear [rad/s].
-        count: Splines along position and speed; 1 for no dependence, otherwise 4 or more.
-        scale: Typical size of the weights [N m], the scale of a fit's steps.
-        weights: Torques [N m], position by position; zero if none are given.
+        count: Number of splines along position and speed; 1 for no dependence, otherwise 4 or more.
+        scale: Typical size of the weights [N m], by which a fit scales its steps.
+        weights: Torques [N m], for each position all speeds; zero if none are given.
 
     Source: C. de Boor, A Practical Guide to Splines, 1978, chapter 9; P. Eilers and B. Marx, Statist. Sci.
     11, 1996.
@@ -87,7 +87,7 @@ class LearnedTorque(Force):
         return {f"w{i}": w for i, w in enumerate(self.weights)}
 
     def own_specifications(self) -> dict[str, Specification]:
-        """One for each weight."""
+        """One specification for each weight."""
         weight = Specification(unit="N m", typical=self.scale, meaning="torque at a spline")
         return dict.fromkeys(self.values, weight)
 

@@ -34,23 +34,23 @@ class Motor(Linear):
         tau = efficiency torque_constant gear_ratio i
         inductance di/dt = v - resistance i - back_emf gear_ratio speed
 
-    Without an inductance the current follows the voltage at once. Not for a motor driven by a
-    current amplifier: that has no back-EMF.
+    Without an inductance the current follows the voltage immediately. Not for a motor on a current
+    amplifier, whose torque does not depend on the back-EMF (`current_drive`).
 
-    In SI units torque constant and back-EMF constant of one motor are one number, and `tied` makes them one:
-    a fit of the torque constant moves the back-EMF with it. Not where the efficiency is a guess: the fitted
-    torque constant then stands for its product with what the gear really loses, and the back-EMF would
+    In SI units the torque constant and the back-EMF constant of a motor are equal. `tied` keeps them equal: a
+    fit of the torque constant then also changes the back-EMF constant. Not if the efficiency is a guess: the
+    fitted torque constant then also contains the true losses of the gear, and the back-EMF constant would
     follow it away from its true value.
 
     Args:
         at: Port the gear drives.
         torque_constant: Torque per current [N m/A].
         back_emf: Voltage per speed of the motor shaft [V s/rad].
-        resistance: Of the armature [ohm].
+        resistance: Armature resistance [ohm].
         gear_ratio: Turns of the motor per turn of the port.
-        efficiency: Of motor and gear together; 1 for none lost.
-        inductance: Of the armature [H], or None.
-        tied: Whether `back_emf` is the torque constant, whatever is given for it.
+        efficiency: Efficiency of motor and gear together; 1 without losses.
+        inductance: Armature inductance [H], or None.
+        tied: Whether `back_emf` always equals the torque constant, whatever value is given for it.
 
     Source: Quanser, SRV02 user manual, 2011, table 3.1 and the section on modelling.
     """
@@ -91,17 +91,17 @@ class Motor(Linear):
 
     @property
     def follows(self) -> dict[str, str]:
-        """The back-EMF constant follows the torque constant, where they are tied."""
+        """The back-EMF constant follows the torque constant, if they are tied."""
         return {"back_emf": "torque_constant"} if self.tied else {}
 
     @property
     def torque_per_current(self) -> Scalar:
-        """At the port [N m/A]."""
+        """Torque at the port per armature current [N m/A]."""
         return self.efficiency * self.torque_constant * self.gear_ratio
 
     @property
     def order(self) -> int:
-        """One state, the current, where there is an inductance."""
+        """One state, the current, if there is an inductance; otherwise none."""
         return 0 if self.inductance is None else 1
 
     def stamp(self) -> Stamp:
@@ -118,7 +118,7 @@ class Motor(Linear):
         )
 
     def sentence(self) -> str:
-        """In words."""
+        """The effect with its values, in one sentence."""
         gain = self.torque_per_current / self.resistance
         speed = math.inf if self.back_emf == 0 else 1 / (self.back_emf * self.gear_ratio)
         return (
@@ -130,11 +130,11 @@ class Motor(Linear):
 @register
 @dataclasses.dataclass(frozen=True)
 class CurrentDrive(Linear):
-    """A motor on a current amplifier: torque in proportion to the command, without back-EMF.
+    """A motor on a current amplifier: torque proportional to the command, without back-EMF.
 
         tau = gain v
 
-    Not for a motor on a voltage amplifier, whose back-EMF brakes it: `Motor`.
+    Not for a motor on a voltage amplifier, where the back-EMF brakes the motor: use `Motor`.
 
     Args:
         at: Port it drives.
@@ -158,7 +158,7 @@ class CurrentDrive(Linear):
         return Stamp(drive=self.gain)
 
     def sentence(self) -> str:
-        """In words."""
+        """The effect with its values, in one sentence."""
         return f"the drive gives the {self.at} {self.gain:.3g} N m/V"
 
 
@@ -169,9 +169,9 @@ class Heating(Memory):
 
         dz/dt = m^2 / (1 + rate z) - z / time,    tau = -rate z / (1 + rate z) m
 
-    `m` is the torque of the cold motor at this port, so `tau` is the lost torque and the heat is that of
-    the current. Not for a recording that is short against `time` and evenly driven:
-    the loss is then equivalent to a lower torque constant.
+    `m` is the torque of the cold motor at this port, so `tau` is the lost torque; the current heats the
+    armature. Not for a recording that is much shorter than `time` with a uniform input: the loss is then
+    equivalent to a lower torque constant.
 
     Args:
         at: Port of the motor.
@@ -206,11 +206,11 @@ class Heating(Memory):
 
     @classmethod
     def probes(cls, scale: Scale) -> list[list[Probe]]:
-        """One direction at each of two times of cooling."""
+        """One direction of the score test at each of two time constants of cooling."""
         return [[{"rate": 0.01 / scale.torque**2, "time": time}] for time in (10.0, 100.0)]
 
     def sentence(self) -> str:
-        """In words."""
+        """The effect with its values, in one sentence."""
         return (
             f"the motor at the {self.at} warms up: its resistance rises by {self.rate:.3g} per second and "
             f"(N m)^2 of torque, and cools with a time constant of {self.time:.3g} s"
@@ -224,9 +224,10 @@ class TorqueSaturation(Force):
 
         tau = -loss |m| / (1 + loss |m|) m
 
-    `m` is what the current of the motor would give at this port in proportion. The torque starts there and
-    stays below `1 / loss`: the iron of a small motor saturates, and its armature weakens the field. Not for
-    a motor that is driven at one level of torque, where the loss is equivalent to a lower torque constant.
+    `m` is the torque at this port in proportion to the current of the motor. Small torques are nearly equal
+    to `m`, large ones stay below `1 / loss`, since the iron of a small motor saturates and the armature
+    weakens the field. Not for a motor that runs at one level of torque, where the loss is equivalent to a
+    lower torque constant.
 
     Args:
         at: Port of the motor.
@@ -256,11 +257,11 @@ class TorqueSaturation(Force):
 
     @classmethod
     def probes(cls, scale: Scale) -> list[list[Probe]]:
-        """One direction."""
+        """One direction of the score test."""
         return [[{"loss": 0.1 / scale.torque}]]
 
     def sentence(self) -> str:
-        """In words."""
+        """The effect with its values, in one sentence."""
         half = 1 / max(self.loss, 1e-12)
         return (
             f"the torque of the motor at the {self.at} grows less than in proportion to its current: half of "
@@ -269,16 +270,17 @@ class TorqueSaturation(Force):
 
 
 DYNAMIXEL_GAIN_SCALE = 4096 / (2 * math.pi) / (256 * 885)
-"""Duty per radian of error and per unit of the P gain of a Dynamixel X: counts of the encoder per radian, by
-the divisor 256 of the gain and the 885 counts of full duty [1/rad]. The logged duty of an XL-330 agrees to
-0.3 %; its manual gives the divisor 128."""
+"""Duty per radian of error and per unit of the P gain of a Dynamixel X [1/rad]: counts of the encoder per
+radian, divided by 256 (the divisor of the gain) and by 885 (the counts of full duty). The logged duty of an
+XL-330 agrees to 0.3 %; its manual gives the divisor 128."""
 
 
 @dataclasses.dataclass(frozen=True)
 class PositionLoop(Linear):
-    """What servos under a position loop have in common: the motor, the firmware's numbers, the limit.
+    """Common base class of servos under a position loop: motor, settings of the firmware, limit of the duty.
 
-    A base class, no effect: `PositionServo` has a P gain and perhaps a D gain, `PidServo` an I gain too.
+    The class itself is no effect. `PositionServo` has a P gain and optionally a D gain, `PidServo` also has
+    an I gain.
     """
 
     amplitudes: ClassVar[tuple[str, ...]] = ("torque_constant",)
@@ -319,7 +321,7 @@ class PositionLoop(Linear):
 
     @property
     def further_parts(self) -> tuple[str, ...]:
-        """What was given of the parts that most servos lack, with its size."""
+        """Optional parts that were given and that most servos lack, as texts with their sizes."""
         declared = self.declared()
         names = ("derivative", "dead_band", "source_resistance", "integral")
         parts = {n: self.values.get(n) for n in names}
@@ -328,18 +330,18 @@ class PositionLoop(Linear):
 
     @property
     def torque_per_current(self) -> Scalar:
-        """At the port [N m/A]."""
+        """Torque at the port per armature current [N m/A]."""
         return self.torque_constant
 
     @property
     def _torque_per_volt(self) -> Scalar:
-        """Of the armature at rest [N m/V]."""
+        """Torque at rest per voltage of the armature [N m/V]; zero where the torque is off."""
         found = self.torque_constant / self.resistance
         return found if self.enabled is None else self.enabled * found
 
     @property
     def _torque_per_duty(self) -> Scalar:
-        """At rest [N m]."""
+        """Torque at rest per duty [N m]."""
         return self._torque_per_volt * self.supply
 
     def stamp(self) -> Stamp:
@@ -351,15 +353,15 @@ class PositionLoop(Linear):
         return Stamp(stiffness=stiffness, drive=stiffness, damping=braking)
 
     def _error(self, position: Scalar, speed: Scalar, goal: Scalar) -> Scalar:
-        """Goal less the angle, which the firmware has half a period late [rad]."""
+        """Goal less the angle, which the firmware knows on average half a control period late [rad]."""
         return goal - position + self.period / 2 * speed
 
     def _counted(self, error: Scalar) -> Scalar:
-        """What the firmware takes for an error, beyond its dead band [rad]."""
+        """Part of an error beyond the dead band of the firmware [rad]."""
         return error if self.dead_band is None else error - within(error, -self.dead_band, self.dead_band)
 
     def _wanted(self, position: Scalar, speed: Scalar, goal: Scalar) -> tuple[Scalar, Scalar]:
-        """Duty by P and D gain before the limit: as the linear loop has it, and with the dead band."""
+        """Duty of P and D gain before the limit: first of the linear loop, then with the dead band."""
         error = self._error(position, speed, goal)
         linear = wanted = self.gain * self.gain_scale * error
         if self.dead_band is not None:
@@ -369,7 +371,7 @@ class PositionLoop(Linear):
         return linear, wanted
 
     def duty(self, position: Scalar, speed: Scalar, goal: Scalar, integral: Scalar | None = None) -> Scalar:
-        """Duty that the firmware gives; `integral` is that of its I gain. Zero where the torque is off."""
+        """Duty that the firmware gives, zero with the torque off; `integral` is the duty of the I gain."""
         wanted = self._wanted(position, speed, goal)[1]
         given = within(wanted if integral is None else wanted + integral, -self.limit, self.limit)
         return given if self.enabled is None else self.enabled * given
@@ -380,7 +382,7 @@ class PositionLoop(Linear):
         """Torque [N m] by which the motor differs from the linear loop."""
         linear, wanted = self._wanted(position, speed, goal)
         before = wanted if integral is None else wanted + integral
-        # What the limit takes away, added: nothing is rounded below it.
+        # The effect of the limit as a difference: below the limit it is exactly zero, without rounding.
         off = within(before, -self.limit, self.limit) - before
         if self.dead_band is not None:
             off = off + (wanted - linear)
@@ -394,7 +396,7 @@ class PositionLoop(Linear):
         return self._torque_per_volt * ((supply - self.supply) * duty + self.supply * off)
 
     def sentence(self) -> str:
-        """In words."""
+        """The effect with its values, in one sentence."""
         stall = self._torque_per_duty * self.limit
         speed = math.inf if self.torque_constant == 0 else self.supply * self.limit / self.torque_constant
         return (
@@ -411,28 +413,29 @@ class PositionServo(PositionLoop, Force):
         duty = min(max(gain gain_scale (goal - (position - period / 2 speed)), -limit), limit)
         tau = torque_constant / resistance (supply duty - torque_constant speed)
 
-    and with the parts that are left out unless they are given
+    and with the optional parts, which are omitted unless they are given
 
         duty = min(max(gain gain_scale band(goal - ...) - derivative speed, -limit), limit),
         band(e) = 0 for |e| <= dead_band,  e - dead_band sign(e) beyond
         supply - source_resistance duty i  in the place of the supply,  i the current of the armature
 
-    Angle, speed and torque are those of the output shaft, so that the torque constant contains the gear's
-    ratio and stands for the back-EMF as well. Firmware computes a duty from the angle once in every period
-    and holds it, so that on average it acts half a period late on the angle, here to first order: a loss of
-    damping, which a fit would take for less back-EMF. That it reads whole counts makes steps in the torque
-    far below friction and is left out. The D gain acts on the measured speed alone, since a goal that is held
-    between samples has none. Not for a servo whose I gain is set, or that plans a profile towards its goal.
+    Angle, speed and torque are quantities of the output shaft, so the torque constant contains the gear ratio
+    and also determines the back-EMF. The firmware computes the duty from the angle once in every period and
+    holds it, so on average the duty is half a period late. The model contains this delay to first order: it
+    reduces the damping, which a fit would otherwise attribute to a smaller back-EMF. The quantisation of the
+    angle is neglected, since the steps that it causes in the torque are far below friction. The D gain acts
+    on the measured speed alone, since a goal that is held between samples has no speed. Not for a servo with
+    an I gain, or for a servo that plans a profile towards its goal.
 
-    Where the duty is below its limit, the loop is linear and the step integrates it exactly; the limit takes
-    away a torque beyond that, by the rule for smooth torques. There a step must be short against the loop,
-    `Ts sqrt(stiffness / inertia)` below 0.15 for errors of about a count of an encoder, with the stiffness
-    `torque_constant / resistance * supply * gain * gain_scale`: above it use `Exponential(order=4)` or
-    `substeps`.
+    While the duty is below its limit, the loop is linear and the step integrates it exactly. At the limit the
+    step subtracts a torque, by the rule for smooth torques. There the step must be short compared with the
+    loop: `Ts sqrt(stiffness / inertia)` below 0.15 gives errors of about one count of an encoder, with the
+    stiffness `torque_constant / resistance * supply * gain * gain_scale`. Above it use
+    `Exponential(order=4)` or `substeps`.
 
     Gain, limit and supply are known, and the gain may differ between recordings (`Recording.constants`).
-    Torque constant and resistance follow from a motion under a known load; with viscous damping at the
-    same port only if that is known, for back-EMF and damping add up.
+    A motion under a known load identifies torque constant and resistance; with viscous damping at the same
+    port only if the damping is known, since back-EMF and damping add up.
 
     Args:
         at: Port the servo drives.
@@ -442,10 +445,10 @@ class PositionServo(PositionLoop, Force):
         supply: Supply voltage [V].
         period: Control period of the firmware [s].
         torque_constant: Torque per current, equal to voltage per speed [N m/A].
-        resistance: Of the armature [ohm].
-        derivative: Duty that the D gain takes away per speed [s/rad], or None.
-        dead_band: Error of the angle that the firmware takes for none [rad], or None.
-        source_resistance: Of supply and cable, by which the voltage falls under current [ohm], or None.
+        resistance: Armature resistance [ohm].
+        derivative: Duty per speed that the D gain subtracts [s/rad], or None.
+        dead_band: Largest error of the angle that the firmware ignores [rad], or None.
+        source_resistance: Resistance of supply and cable, which lowers the voltage under load [ohm], or None.
         enabled: 1 where the torque is on, 0 where it is off; None for a servo whose torque is always on.
 
     Source: Duclusaud, Passault, Padois, Ly 2024, Extended friction models for the physics simulation of
@@ -477,13 +480,13 @@ class PidServo(PositionLoop, Memory):
         duty = min(max(wanted, -limit), limit)
         dz/dt = integral band(e) - anti_windup (wanted - duty)
 
-    The motor is that of `PositionServo`. The state z is the duty of the I gain. While the duty is at its
-    limit, what is wanted beyond it is led back to the integral (back-calculation), as in the firmware of a
-    Dynamixel X, whose manual draws an anti-windup gain and does not say its size: release `anti_windup` where
-    a log reaches the limit. A large one keeps the integral from growing there.
+    The motor is the motor of `PositionServo`. The state z is the duty of the I gain. While the duty is at its
+    limit, the duty beyond the limit is fed back to the integral (back-calculation), as in the firmware of a
+    Dynamixel X. Its manual shows an anti-windup gain without a value: release `anti_windup` if a log reaches
+    the limit. A large value keeps the integral from growing at the limit.
 
-    The I part is a torque of the step, linear in time over it; the rest of the loop is exact below the limit.
-    Not for a servo without an I gain, for which `PositionServo` has one state less.
+    The step treats the I part as a torque that is linear in time over the step; the rest of the loop is exact
+    below the limit. Not for a servo without an I gain: `PositionServo` has one state less.
 
     Args:
         at: Port the servo drives.
@@ -493,13 +496,13 @@ class PidServo(PositionLoop, Memory):
         supply: Supply voltage [V].
         period: Control period of the firmware [s].
         torque_constant: Torque per current, equal to voltage per speed [N m/A].
-        resistance: Of the armature [ohm].
-        derivative: Duty that the D gain takes away per speed [s/rad], or None.
-        dead_band: Error of the angle that the firmware takes for none [rad], or None.
-        source_resistance: Of supply and cable, by which the voltage falls under current [ohm], or None.
+        resistance: Armature resistance [ohm].
+        derivative: Duty per speed that the D gain subtracts [s/rad], or None.
+        dead_band: Largest error of the angle that the firmware ignores [rad], or None.
+        source_resistance: Resistance of supply and cable, which lowers the voltage under load [ohm], or None.
         enabled: 1 where the torque is on, 0 where it is off; None for a servo whose torque is always on.
         integral: Duty per error and second of the I gain [1/(rad s)].
-        anti_windup: Rate at which a duty beyond the limit is led back [1/s].
+        anti_windup: Rate of the back-calculation, which reduces the integral at the limit [1/s].
 
     Source: Robotis, XM430-W210 e-manual, section on the position PID gains (control tables 80, 82, 84, and
         the anti-windup gain K_a); K. J. Astrom and T. Hagglund, PID Controllers, 2nd ed., 1995, section 3.5.
@@ -536,13 +539,13 @@ class PidServo(PositionLoop, Memory):
 
 @dataclasses.dataclass(frozen=True)
 class Meter(Memory):
-    """What an instrument shows of the motor: a first-order filter, and no torque.
+    """Reading of a quantity of the motor by an instrument: a first-order filter without torque.
 
         dz/dt = (x - z) / time
 
-    A base class, no effect. The state is the reading, which an output shows: `outputs={"current": ("hub",
-    "current")}`. Within a sample the motor's value is that in the middle of it, so a reading is at least the
-    mean over the sample before.
+    The class itself is no effect. The state is the reading, which an output shows: `outputs={"current":
+    ("hub", "current")}`. Over a sample the filter uses the value of the motor in the middle of the sample. So
+    a reading is averaged at least over the preceding sample.
     """
 
     ports: ClassVar[tuple[str, ...]] = ("hub",)
@@ -559,7 +562,7 @@ class Meter(Memory):
         return 0.0 * drive
 
     def sentence(self) -> str:
-        """In words."""
+        """The effect with its values, in one sentence."""
         return f"the reading of the {self.shows} follows the motor at the {self.at} within {self.time:.3g} s"
 
 
@@ -570,11 +573,11 @@ class CurrentMeter(Meter):
 
         dz/dt = (i - z) / time
 
-    For a log with the current, as servos and drives write it. Goal and angle alone determine the torques of a
-    servo only up to a common factor; a current in amperes sets that factor, since the torque per current is
-    the back-EMF per speed: an inertia that is trusted otherwise may be released. In counts of an unknown size
-    it needs a `SensorGain` beside it and sets no factor. Not for a current amplifier, whose current is the
-    input.
+    For a log that contains the current, as servos and drives write it. Goal and angle alone determine the
+    torques of a servo only up to a common factor. A current in amperes determines this factor, since the
+    torque per current equals the back-EMF per speed; an inertia that is otherwise trusted may then be
+    released. A current in counts of unknown size needs an additional `SensorGain` and does not determine the
+    factor. Not for a current amplifier, whose current is the input.
 
     Args:
         at: Port of the motor.
@@ -591,7 +594,7 @@ class CurrentMeter(Meter):
 
     @classmethod
     def needs(cls) -> tuple[str, ...]:
-        """A motor that says its torque per current."""
+        """A motor whose torque per current is known."""
         return ("motor whose current is known",)
 
 
@@ -602,8 +605,9 @@ class DutyMeter(Meter):
 
         dz/dt = (duty - z) / time
 
-    For a log with the duty, the PWM or the load in shares of the supply. It is what the firmware computes
-    from goal and angle, so it checks the firmware's numbers and says little about the motor.
+    For a log with the duty, the PWM or the load as a share of the supply. The firmware computes the duty from
+    goal and angle, so the duty checks the settings of the firmware and contains little information about the
+    motor.
 
     Args:
         at: Port of the servo.

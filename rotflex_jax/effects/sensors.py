@@ -11,22 +11,22 @@ from rotflex_jax.parameters import parameter
 
 # A sensor that reads less than half of the true value or more than twice has another scale, not an error.
 _OUT_OF_CALIBRATION = (-0.5, 1.0)
-# No disc of an encoder is further out of its centre than this share of its radius. Over a part of a turn a
-# larger one would be a gain of the sensor.
+# Limits of the eccentricity of an encoder disc, as a share of its radius. Over a part of a turn, a larger
+# eccentricity would act like a gain error of the sensor.
 _OUT_OF_CENTRE = (-0.05, 0.05)
-# Sensors that read more of each other than this are connected wrongly, which no search is needed for.
+# Limits of cross-talk. A larger share means wrong connections, for which no search is needed.
 _CROSSED = (-0.1, 0.1)
 
 
 @register
 @dataclasses.dataclass(frozen=True)
 class SensorGain(Sensing):
-    """A reading in constant proportion to the true value, but not equal to it.
+    """A reading that is proportional to the true value, but not equal to it.
 
         y = (1 + error) value
 
-    Only the ratio of the two sensors' gains can be found, since a common factor is one of torque;
-    it is searched at the deflection and relative to the sensor of the servo angle.
+    Only the ratio of the gains of the two sensors can be identified, since a common factor is equivalent to a
+    factor of the torque. The error is searched at the deflection, relative to the sensor of the servo angle.
 
     Args:
         at: Channel.
@@ -43,7 +43,7 @@ class SensorGain(Sensing):
     searched: ClassVar[tuple[str, ...]] = ("alpha",)
     relative: ClassVar[bool] = True
 
-    # The bound keeps the gain positive: a sensor that reads nothing is not out of calibration.
+    # The bound keeps the gain positive: a sensor with a gain of zero measures nothing.
     error: float = parameter(
         0.0,
         unit="",
@@ -59,11 +59,11 @@ class SensorGain(Sensing):
 
     @classmethod
     def probes(cls, scale: Scale) -> list[list[Probe]]:
-        """One direction."""
+        """One direction of the score test."""
         return [[{"error": 0.05}]]
 
     def sentence(self) -> str:
-        """In words."""
+        """The effect with its values, in one sentence."""
         more = "more" if self.error >= 0 else "less"
         return f"the sensor of {self.at} reads {abs(self.error):.2%} {more} than the true value"
 
@@ -75,8 +75,8 @@ class SensorBias(Sensing):
 
         y = value + bias
 
-    Not searched at the servo angle: a joint that turns freely has no zero of its own, so a bias
-    there is the unknown angle at the start.
+    Not searched at the servo angle: a joint that turns freely has no fixed zero, so a bias there is
+    equivalent to the unknown angle at the start.
 
     Args:
         at: Channel.
@@ -101,11 +101,11 @@ class SensorBias(Sensing):
 
     @classmethod
     def probes(cls, scale: Scale) -> list[list[Probe]]:
-        """One direction."""
+        """One direction of the score test."""
         return [[{"bias": 0.05 * scale.position}]]
 
     def sentence(self) -> str:
-        """In words."""
+        """The effect with its values, in one sentence."""
         return (
             f"the sensor of {self.at} reads {self.bias:+.3g} rad "
             f"({math.degrees(self.bias):+.2g} degrees) at zero"
@@ -145,7 +145,7 @@ class SensorCubic(Sensing):
         return value + self.cubic * value * value * value
 
     def largest_reading(self) -> float:
-        """That at `3 |cubic| value^2 = 1` for a negative `cubic`, from where on readings fall again."""
+        """For a negative `cubic` the reading at `3 |cubic| value^2 = 1`, beyond which readings fall again."""
         return 2.0 / 3.0 / math.sqrt(-3.0 * float(self.cubic)) if self.cubic < 0 else math.inf
 
     @classmethod
@@ -154,7 +154,7 @@ class SensorCubic(Sensing):
         return [[{"cubic": 0.05 / (3 * scale.position) ** 2}]]
 
     def sentence(self) -> str:
-        """In words."""
+        """The effect with its values, in one sentence."""
         more = "more" if self.cubic >= 0 else "less"
         return (
             f"the sensor of {self.at} is not straight: it reads {abs(self.cubic):.3g} times the cube of "
@@ -170,8 +170,8 @@ class Rectifier(Sensing):
         y = value if value > 0, (1 - loss) value otherwise
 
     A loss of 1 is a half-wave rectifier, a loss of 2 a full-wave one (the reading is the absolute
-    value). Not for a sensor with an offset: where the kink lies elsewhere than at zero, this
-    compares gains about the wrong point.
+    value). Not for a sensor with an offset: its kink is not at zero, so this effect would compare the gains
+    below and above the wrong point.
 
     Args:
         at: Channel.
@@ -195,11 +195,11 @@ class Rectifier(Sensing):
 
     @classmethod
     def probes(cls, scale: Scale) -> list[list[Probe]]:
-        """One direction."""
+        """One direction of the score test."""
         return [[{"loss": 0.05}]]
 
     def sentence(self) -> str:
-        """In words."""
+        """The effect with its values, in one sentence."""
         if self.loss >= 0:
             return f"the sensor of {self.at} loses {self.loss:.2%} of what is below zero"
         return f"the sensor of {self.at} reads {-self.loss:.2%} more below zero than above"
@@ -208,16 +208,17 @@ class Rectifier(Sensing):
 @register
 @dataclasses.dataclass(frozen=True)
 class EccentricEncoder(Sensing):
-    """An encoder whose disc does not turn about its own centre: an error that repeats once per turn.
+    """An encoder whose disc does not turn about its centre: an error that repeats once per turn.
 
         y = value + cosine cos(value) + sine sin(value)
 
-    Two amplitudes instead of one and a phase, because the zero of the angle is where the recording began.
-    An eccentricity `e` of a disc of radius `r` gives an amplitude of `e / r`. Not where the shaft of the
-    encoder turns much less than once: a bias, a gain and a curvature (`sensor_cubic`) are the same there.
+    The law has two amplitudes instead of one amplitude and a phase, because the angle is zero where the
+    recording began. An eccentricity `e` of a disc of radius `r` gives an amplitude of `e / r`. Not for an
+    encoder shaft that turns much less than once: there the effect is equivalent to a bias, a gain error and a
+    curvature (`sensor_cubic`).
 
     Args:
-        at: Channel of an angle, as the shaft of the encoder turns.
+        at: Channel of an angle, equal to the angle of the encoder shaft.
         cosine: Amplitude of the cosine [rad].
         sine: Amplitude of the sine [rad].
 
@@ -233,7 +234,7 @@ class EccentricEncoder(Sensing):
     searched: ClassVar[tuple[str, ...]] = ("theta",)
     turning: ClassVar[bool] = True
 
-    # An amplitude of one turns the reading back.
+    # From an amplitude of one on, the reading is no longer monotonic.
     cosine: float = parameter(
         0.0,
         unit="rad",
@@ -264,11 +265,11 @@ class EccentricEncoder(Sensing):
 
     @classmethod
     def probes(cls, scale: Scale) -> list[list[Probe]]:
-        """Two directions, cosine and sine."""
+        """Two directions of the score test, cosine and sine."""
         return [[{"cosine": 0.01, "sine": 0.0}, {"cosine": 0.0, "sine": 0.01}]]
 
     def sentence(self) -> str:
-        """In words."""
+        """The effect with its values, in one sentence."""
         size = math.hypot(self.cosine, self.sine)
         return (
             f"the sensor of {self.at} is out of centre: its error of up to {size:.3g} rad "
@@ -279,16 +280,16 @@ class EccentricEncoder(Sensing):
 @register
 @dataclasses.dataclass(frozen=True)
 class CrossTalk(Sensing):
-    """A share of another channel in a reading: crossed wires, or axes of two sensors that are not apart.
+    """A share of another channel in a reading: crossed wires, or two sensors whose axes are coupled.
 
         y = value + share other
 
-    `other` is the true value of the other sensor, of several the first. Not for a servo angle with a share
-    of the deflection in it: the two are one angle at another place of the shaft.
+    `other` is the true value of the other sensor, or of the first of several others. Not for a servo angle
+    with a share of the deflection in it: this is the angle at another place of the shaft.
 
     Args:
         at: Channel that the other one disturbs.
-        share: Of the other channel in its reading [unit of the channel per unit of the other].
+        share: Share of the other channel in the reading [unit of the channel per unit of the other].
 
     Source: P. Horowitz and W. Hill, The Art of Electronics, 3rd ed., 2015, section 8.16.
     """
@@ -312,26 +313,27 @@ class CrossTalk(Sensing):
 
     @classmethod
     def probes(cls, scale: Scale) -> list[list[Probe]]:
-        """One direction."""
+        """One direction of the score test."""
         return [[{"share": 0.01}]]
 
     def sentence(self) -> str:
-        """In words."""
+        """The effect with its values, in one sentence."""
         return f"the sensor of {self.at} also reads {self.share:+.3g} times what the other sensor should"
 
 
 @register
 @dataclasses.dataclass(frozen=True)
 class ChannelDelay(Sensing):
-    """A sensor whose reading comes late, alone among the sensors.
+    """A delay of the reading of one sensor relative to the other sensors.
 
         y(t) = value(t - time)
 
-    The way covered in the meantime follows from the speed by a filter of order two, the Pade approximation
-    of the delay, which is stepped exactly with the machine: its relative error is `(W time)^5 / 720` at the
-    angular frequency `W`, 0.0001 at 16 Hz for 6 ms. A jump of the voltage is a corner of the speed, which the
-    filter rounds: for delays of a few samples only. Where all sensors are late by the same time, it is the
-    input that is (`delay`). At the start the machine counts as having been at rest.
+    The distance covered during the delay follows from the speed by a filter of order two, the Pade
+    approximation of the delay, which the step integrates exactly together with the machine. Its relative
+    error is `(W time)^5 / 720` at the angular frequency `W`, 0.0001 at 16 Hz for 6 ms. A jump of the voltage
+    gives a corner of the speed, which the filter smooths: use the effect for delays of a few samples only.
+    The same delay of all sensors is equivalent to a delay of the input (`delay`). Before the start the
+    machine is assumed to be at rest.
 
     Args:
         at: Channel of a position or a speed.
@@ -355,7 +357,7 @@ class ChannelDelay(Sensing):
 
     @property
     def order(self) -> int:
-        """Two states: how far the reading is behind, and the rate of that times the delay."""
+        """Two states: the true value less the reading, and the rate of this difference times the delay."""
         return 2
 
     def stamp(self) -> Stamp:
@@ -384,5 +386,5 @@ class ChannelDelay(Sensing):
         return [[{"time": 0.001}], [{"time": 0.004}]]
 
     def sentence(self) -> str:
-        """In words."""
+        """The effect with its values, in one sentence."""
         return f"the sensor of {self.at} reads what was true {1e3 * self.time:.3g} ms ago"

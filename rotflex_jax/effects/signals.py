@@ -1,4 +1,4 @@
-"""What measured signals do to the machine beside its input: in textbooks, measured disturbances."""
+"""Effects of signals that are measured beside the input: measured disturbances."""
 
 import dataclasses
 from typing import ClassVar
@@ -11,24 +11,24 @@ from rotflex_jax.parameters import parameter
 @register
 @dataclasses.dataclass(frozen=True)
 class MeasuredDisturbance(Force):
-    """A torque in proportion to a signal that was measured beside input and outputs.
+    """A torque proportional to a measured signal other than input and outputs.
 
         tau = gain signal
 
-    A machine on a moving base is the usual case: with the acceleration of the base as the signal, the gain
-    at each port is minus the inertia that the base carries along. The current of a second motor is another.
-    The signal is held over each sample, as the input is.
+    The usual example is a machine on a moving base: with the acceleration of the base as the signal, the gain
+    at each port is minus the inertia that the base carries along. Another example is the current of a second
+    motor. The signal is held over each sample, as the input is.
 
-    Not for a function of the machine's own outputs, which would explain themselves. The measured motion of a
-    neighbouring body is fine, even where this machine moves that one too.
+    Not for a function of the machine's own outputs: the outputs would then explain themselves. The measured
+    motion of a neighbouring body is allowed, even if this machine also moves that body.
 
     Args:
         at: Port and name of the signal, `"arm: acceleration of link 1 [rad/s^2]"`; recordings have it among
             their `signals`.
-        gain: Torque per unit of the signal [N m, per the unit in its name].
+        gain: Torque per unit of the signal [N m per unit of the signal].
 
     Raises:
-        InputError: `at` does not name both.
+        InputError: `at` does not name a port and a signal.
 
     Source: Ljung, System Identification, 1999, section 1.2 (measured disturbances).
 
@@ -41,7 +41,7 @@ class MeasuredDisturbance(Force):
     equation: ClassVar[str] = "tau = gain * signal"
     acts_on: ClassVar[Domain] = "signal"
     amplitudes: ClassVar[tuple[str, ...]] = ("gain",)
-    # Any signal stands in the place of this one.
+    # The word `signal` stands for the name of any measured signal.
     ports: ClassVar[tuple[str, ...]] = ("hub: signal", "arm: signal", "joint: signal")
     searched: ClassVar[tuple[str, ...]] = ports
 
@@ -61,10 +61,10 @@ class MeasuredDisturbance(Force):
 
     @classmethod
     def probes(cls, scale: Scale) -> list[list[Probe]]:
-        """One direction."""
+        """One direction of the score test."""
         return [[{"gain": 0.1 * scale.torque / scale.signal}]]
 
     def sentence(self) -> str:
-        """In words."""
+        """The effect with its values, in one sentence."""
         per = f" per {self.signal_unit}" if self.signal_unit else ""
         return f"the {self.signal_name} acts at the {self.port} ({self.gain:.3g} N m{per})"

@@ -15,7 +15,7 @@ class Spring(Linear):
 
         tau = -stiffness position
 
-    Not for deflections at which the geometry of the springs shows: add a quadratic or cubic term.
+    Not for deflections at which the springs are no longer linear: add a quadratic or cubic term.
 
     Args:
         at: Port.
@@ -38,22 +38,22 @@ class Spring(Linear):
 
     @classmethod
     def probes(cls, scale: Scale) -> list[list[Probe]]:
-        """One direction."""
+        """One direction of the score test."""
         return [[{"stiffness": 0.1 * scale.torque / scale.position}]]
 
     def sentence(self) -> str:
-        """In words."""
+        """The effect with its values, in one sentence."""
         return f"a spring of {self.stiffness:.3g} N m/rad pulls the {self.at} back"
 
 
 @register
 @dataclasses.dataclass(frozen=True)
 class CubicSpring(Force):
-    """The cubic term of a spring: it hardens, or softens where the stiffness is negative.
+    """The cubic term of a spring that hardens, or softens if the stiffness is negative.
 
         tau = -stiffness position^3
 
-    Not far outside the deflections of the recording: a softening cubic pulls outwards there.
+    Not valid far outside the deflections of the recording: a softening spring would pull outwards there.
 
     Args:
         at: Port.
@@ -77,13 +77,13 @@ class CubicSpring(Force):
 
     @classmethod
     def probes(cls, scale: Scale) -> list[list[Probe]]:
-        """One direction."""
+        """One direction of the score test."""
         return [[{"stiffness": 0.1 * scale.torque / scale.position**3}]]
 
     def sentence(self) -> str:
-        """In words."""
+        """The effect with its values, in one sentence."""
         verb = "hardens" if self.stiffness >= 0 else "softens"
-        # A tenth of a radian is a deflection people can picture.
+        # 0.1 rad is a deflection that is easy to imagine.
         torque = abs(self.stiffness) * 0.1**3
         return (
             f"the spring at the {self.at} {verb} with deflection, by {torque:.3g} N m at 0.1 rad "
@@ -94,11 +94,11 @@ class CubicSpring(Force):
 @register
 @dataclasses.dataclass(frozen=True)
 class QuadraticSpring(Force):
-    """The quadratic term of a spring that is stiffer to one side, as two different springs give.
+    """The quadratic term of a spring that is stiffer to one side, such as a pair of different springs.
 
         tau = -stiffness position^2
 
-    Not far outside the deflections of the recording: to one side it pulls outwards.
+    Not valid far outside the deflections of the recording: to one side it would pull outwards.
 
     Args:
         at: Port.
@@ -122,11 +122,11 @@ class QuadraticSpring(Force):
 
     @classmethod
     def probes(cls, scale: Scale) -> list[list[Probe]]:
-        """One direction."""
+        """One direction of the score test."""
         return [[{"stiffness": 0.1 * scale.torque / scale.position**2}]]
 
     def sentence(self) -> str:
-        """In words."""
+        """The effect with its values, in one sentence."""
         side = "positive" if self.stiffness >= 0 else "negative"
         torque = abs(self.stiffness) * 0.1**2
         return (
@@ -142,14 +142,14 @@ class JointPlay(Force):
 
         tau = stiffness min(max(position, -play), play)
 
-    It comes on top of the linear spring at the port. With `stiffness` equal to the spring's, the
-    spring gives no torque at all within the play; a smaller value is a spring that is softer there.
+    The torque adds to the torque of the linear spring at the port. If `stiffness` equals the stiffness of
+    this spring, there is no torque at all within the play; with a smaller value the spring is softer there.
     Not for play between motor and gear: that is `backlash`.
 
     Args:
         at: Port.
         play: Deflection to each side that is free [rad].
-        stiffness: What the spring lacks within the play [N m/rad].
+        stiffness: Stiffness that the spring lacks within the play [N m/rad].
 
     Source: M. Nordin and P.-O. Gutman, Controlling mechanical systems with backlash, Automatica 38,
     2002, the dead-zone model.
@@ -171,11 +171,11 @@ class JointPlay(Force):
 
     @classmethod
     def probes(cls, scale: Scale) -> list[list[Probe]]:
-        """One direction, the spring wholly missing."""
+        """One direction of the score test: the whole stiffness of the spring is missing within the play."""
         return [[{"play": 0.05 * scale.position, "stiffness": scale.stiffness}]] if scale.stiffness else []
 
     def sentence(self) -> str:
-        """In words."""
+        """The effect with its values, in one sentence."""
         return (
             f"the {self.at} is loose by {self.play:.2g} rad ({math.degrees(self.play):.2g} degrees) to "
             f"each side: {self.stiffness:.3g} N m/rad of its spring are missing there"

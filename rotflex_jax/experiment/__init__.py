@@ -1,4 +1,4 @@
-"""Which effect is true: the input that would tell, and experiments that stop by themselves."""
+"""Experiments to distinguish models: the best next input, and experiments that stop when it is decided."""
 
 from rotflex_jax.experiment.design import next_experiment
 from rotflex_jax.experiment.result import Experiment, Rated, Segment, SequentialResult

@@ -1,4 +1,4 @@
-"""Rival models built into one structure, with what is known of their parameters beforehand."""
+"""Rival models built into one structure, with the prior distributions of their parameters."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -19,8 +19,8 @@ from rotflex_jax.mechanism.mechanism import check_input_alone, process_noise_of
 from rotflex_jax.models.model import Model
 from rotflex_jax.parameters import Transform
 
-# Standard deviations of a fit are those of one recording at one amplitude: they are doubled. No coordinate is
-# less certain than by the second number, or a logarithm would become no statement at all.
+# Standard deviations of a fit hold for one recording at one amplitude: they are multiplied by the first
+# number. The second number limits them: a logarithm with a larger one would be undetermined.
 FIT_SPREAD, LARGEST_SPREAD = 2.0, 2.0
 
 # Uncertainty of a parameter without a standard deviation, as a share of its value.
@@ -35,18 +35,19 @@ def rival_set(
     process_noise: Mapping[str, float] | None = None,
     uncertainty: float = UNKNOWN_SHARE,
 ) -> RivalSet:
-    """Rival models in one structure, with what is known of their parameters.
+    """Rival models in one structure, with the prior distributions of their parameters.
 
     Args:
-        given: Name -> `Fit`, `Model` or `Mechanism`; or a list of these, named by the effects that not all
-            have.
+        given: Name -> `Fit`, `Model` or `Mechanism`; or a list of these, whose names are then the effects
+            that not all models have.
         Ts: Sampling period [s].
-        noise: Channel -> standard deviation of the sensor noise; that of the fits if None.
+        noise: Channel -> standard deviation of the sensor noise; from the fits if None.
         process_noise: Port -> intensity of the process torque [(N m)^2 s]; None for free runs.
-        uncertainty: Standard deviation of parameters that come without one, as a share of their value.
+        uncertainty: Standard deviation of parameters for which none is known, as a share of their value.
 
     Raises:
-        InputError: Fewer than two, machines that differ in more than effects, no noise.
+        InputError: There are fewer than two models, they differ in more than effects, or the noise is not
+            known.
     """
     uncertainty = checks.number(uncertainty, "uncertainty", above=0, example="0.05")
     items = _items(given)
@@ -125,9 +126,9 @@ def rival_set(
 
 
 def _switching_solver(models: Sequence[Model], union: Mechanism) -> Solver:
-    """The solver of the models, with voltages that delays and lags switch where their machine allows it.
+    """The solver of the models, with voltages that switch within a sample if the machine allows it.
 
-    A delay and a lag of a quarter of a sample differ by less than the error of a voltage that is held.
+    A delay and a lag of a quarter of a sample differ by less than the error of holding the voltage.
     """
     solver = models[0].solver
     switched = [
@@ -188,7 +189,7 @@ def _known_covariance(
     pick: np.ndarray,
     uncertainty: float,
 ) -> np.ndarray:
-    """Covariance of unconstrained free parameters: that of a fit, wider; else a share of their values."""
+    """Covariance of unconstrained free parameters: enlarged from a fit, else from a share of their values."""
     whole = np.array([s.typical for s in specs], float)
     whole[pick] = values
     z = transform.unconstrain(whole)
@@ -208,7 +209,8 @@ def _known_covariance(
     sd = np.where(good, np.sqrt(np.where(good, np.diag(C), 1.0)), LARGEST_SPREAD)
     correlation = np.nan_to_num(C / np.outer(sd, sd)) * np.outer(good, good)
     np.fill_diagonal(correlation, 1.0)
-    # Two that only their ratio determines are correlated nearly to one, which rounding may carry beyond.
+    # If only the ratio of two parameters is determined, their correlation is nearly one, and with rounding
+    # errors may exceed it.
     w, V = np.linalg.eigh((correlation + correlation.T) / 2)
     correlation = (V * np.maximum(w, 1e-9)) @ V.T
     sd = np.clip(sd, 1e-6, LARGEST_SPREAD)
@@ -219,10 +221,10 @@ def _known_covariance(
 def noise_std(
     given: Sequence[Any], noise: Mapping[str, float] | None, channels: tuple[str, ...]
 ) -> Float[np.ndarray, " C"]:
-    """Standard deviation of the sensor noise per channel: as given, or the least of the fits.
+    """Standard deviation of the sensor noise of each channel: the given one, or the least of the fits.
 
     Raises:
-        InputError: It is known of neither, or not of every channel.
+        InputError: The noise is neither given nor known from a fit, or not for every channel.
     """
     if noise is None:
         fits = [g for g in given if isinstance(g, Fit)]

@@ -40,7 +40,7 @@ Progress = Callable[[str], None]
 
 # One period of a design [s].
 DESIGN_PERIOD = 4.0
-# Uncertainty of a parameter without a standard deviation from a fit, as a share of its value.
+# Uncertainty of a parameter for which no fit gives a standard deviation, as a share of its value.
 DEFAULT_UNCERTAINTY = 0.05
 # Evidence that makes one of two equally probable effects 99 % probable [nat].
 ENOUGH = math.log(99)
@@ -101,43 +101,44 @@ def next_experiment(
 
         maximise over u   min over (A true, B true)  min over n  1/2 sum_k |L (y_k(u) - y_hat_k(u; n))|^2
 
-    `y` is the run of the model with one effect, `y_hat` the prediction by the model with the other, fitted
-    to it over all that a new recording leaves open (n): the rival's parameters, every free parameter, first
-    state, offset, bias. Half the sum is the log-likelihood by which the true model is expected to win [nat].
-    The standard inputs are ranked; the best are then optimised by the gradient through both simulations.
+    `y` is the run of the model with one effect. `y_hat` is the prediction of the model with the other effect,
+    fitted to `y` in all unknowns of a new recording (n): the parameters of the rival effect, every free
+    parameter, first state, offset, bias. Half the sum is the log-likelihood by which the true model is
+    expected to win [nat]. The standard inputs are ranked; the best are then optimised by the gradient through
+    both simulations.
 
-    Not where the fitted model is far from the machine: the design relies on its prediction of small
-    differences, at frequencies that the recording may not contain. Compare with the standard inputs in
-    `table`, which demand less of the model.
+    Not if the fitted model is far from the machine: the design relies on its prediction of small differences,
+    at frequencies that the recording may not contain. Compare with the standard inputs in `table`, which
+    require less of the model.
 
-    With models alone (name -> `Fit` or `Model`, a list of them, or the result of a search), all of them are
-    told apart: the input after which a wrong answer is least probable, for the worst of a few draws of what
-    is not known of their parameters, as each step of `experiment_until` chooses it.
+    With several models and no effects (name -> `Fit` or `Model`, a list of them, or the result of a search),
+    the input distinguishes all of them. It is the input after which a wrong answer is least probable, for the
+    worst of a few draws of the uncertain parameters, as in each step of `experiment_until`.
 
     Args:
-        model: Fitted model, with one of the effects or with neither; a `Fit` brings noise and intervals. Or
+        model: Fitted model, with one of the effects or with neither; a `Fit` has noise and intervals. Or
             several models, without `a` and `b`.
-        a: The first effect: "delay@input", ("delay", "input") or an effect with its parameters. An effect
-            that is in the model has the model's parameters; one that is only named is fitted to the other
-            under `reference`; if both are only named, the first has the catalogue's parameters.
+        a: The first effect: "delay@input", ("delay", "input") or an effect with its parameters. An effect in
+            the model has the parameters of the model. An effect that is only named is fitted to the other
+            effect under `reference`; if both are only named, the first has the parameters of the catalogue.
         b: The second effect.
         limits: Limits of the machine.
         seconds: Length of the experiment [s].
         Ts: Sampling period [s].
         noise: Channel -> standard deviation of the sensor noise.
         process_noise: Port -> intensity of the process torque in the fit [(N m)^2 s]; None for a free run.
-        reference: Voltage of the recording that does not distinguish the two [V]; noise if None.
+        reference: Voltage of the recording that does not distinguish the two effects [V]; noise if None.
         improve: Whether to optimise the best standard inputs, or only to rank them.
-        starts: Standard inputs to optimise.
-        looks: Evaluations of each optimisation at most.
-        probabilities: Of several models beforehand, by name or in their order.
+        starts: Number of standard inputs to optimise.
+        looks: Largest number of evaluations of each optimisation.
+        probabilities: Prior probabilities of several models, by name or in their order.
         progress: Called with a line of text now and then.
 
     Returns:
-        Experiment, of several models a Segment.
+        Experiment; for several models a Segment.
 
     Raises:
-        InputError: Unknown or equal effects, no noise, or an impossible length.
+        InputError: The effects are unknown or equal, the noise is not given, or the length is not possible.
 
     Source: Atkinson and Fedorov 1975 (T-optimality, Biometrika 62); Pasch-Hausdorff envelopes for the slew.
     """
@@ -239,7 +240,7 @@ def _notes(model: Fit | Model | Mechanism, chosen: Rated) -> tuple[str, ...]:
     return tuple(notes)
 
 
-# An input with its rating and its result, as they are ranked.
+# Rating, voltage and result of an input, as they are ranked.
 _RatedInput = tuple[Rated, np.ndarray, Discrimination]
 
 
@@ -248,7 +249,7 @@ def _evidence(row: _RatedInput) -> float:
 
 
 def _rate_input(problem: DiscriminationProblem, s: StandardInput, thorough: bool = False) -> _RatedInput:
-    """An input within all limits, its evidence, and the result under it."""
+    """The input scaled to all limits, with its rating and its result."""
     u = problem.scaled_to_limits(s.u)
     result = problem.evaluate(u, thorough=thorough)
     peaks = dict(zip(problem.pair[0].mechanism.channels, problem.peaks(u).tolist(), strict=True))
@@ -262,7 +263,7 @@ def _rate_input(problem: DiscriminationProblem, s: StandardInput, thorough: bool
 def _count_directions(
     problem: DiscriminationProblem, rated: Rated, u: np.ndarray, result: Discrimination
 ) -> _RatedInput:
-    """The same with only the directions that count."""
+    """A rated input with the evidence of only the directions that count."""
     result = dataclasses.replace(result, counted=problem.counted)
     return dataclasses.replace(rated, nats=result.nats), u, result
 
@@ -277,7 +278,7 @@ def _rival_pair(
     reference: np.ndarray | None,
     limits: Limits,
 ) -> tuple[RivalModel, RivalModel]:
-    """Both rival models; the one whose effect has no known parameters is fitted to the other."""
+    """Both rival models; the one whose effect has no known parameters is fitted to the other one."""
     locations = effect_location(a), effect_location(b)
     if locations[0] == locations[1]:
         raise InputError(
@@ -303,14 +304,14 @@ def _rival_pair(
     y = free_run_from_rest(pair[true], u, Ts)
     best = best_rival_fit(fitted, u, y, Ts, [fitted.start, *starts_with_other_shapes(fitted)])
     mechanism = fitted.with_unknowns(best.unknowns).mechanism
-    # Offset and bias belong to a recording: the next one has its own.
+    # Offset and bias belong to a recording; the next recording has its own.
     mechanism = mechanism.with_values(dict.fromkeys(fitted.calibrations, 0.0))
     pair[rival] = dataclasses.replace(pair[rival], mechanism=mechanism)
     return pair[0], pair[1]
 
 
 def sample_counts(seconds: float, Ts: float) -> tuple[int, int]:
-    """Samples of the experiment and of one period."""
+    """Number of samples of the experiment and of one period of a design."""
     length, period = checks.real(seconds), checks.real(Ts)
     if not (0 < period < 0.5 and 200 <= length / period < np.inf):
         raise InputError(

@@ -1,7 +1,7 @@
-"""The evidence that an input gives for one of two models, and gradient ascent on that input.
+"""The evidence with which an input distinguishes two models, and gradient ascent on the input.
 
-T-optimality: the run of one model is fitted by its rival, and half the squared whitened residuals are the
-log-likelihood by which the true model is expected to win.
+T-optimality: the rival is fitted to the run of the true model, and half the squared whitened residuals are
+the log-likelihood by which the true model is expected to win.
 """
 
 import dataclasses
@@ -21,12 +21,12 @@ from rotflex_jax.experiment.rival_fit import (
 from rotflex_jax.experiment.standard_inputs import Limits
 
 # Further starts of a rival fit: factors of every parameter of the rival's effect that is not an amplitude,
-# since least squares from one start finds the local minimum of that shape.
+# because least squares from one start finds only the local minimum of that shape.
 SHAPE_FACTORS = (0.6, 1.6)
-# A model is nested in its rival where the rival reproduces its run to this share of the evidence of the
-# opposite case, or to so little that no recording would decide [nat].
+# A model counts as nested in its rival if the rival reproduces its run up to this share of the evidence of
+# the opposite case, or up to an evidence that no recording would decide by [nat].
 NESTED_SHARE, NEGLIGIBLE_EVIDENCE = 0.05, 10.0
-# Exponent of the smooth maximum whose gradient stands for that of a peak.
+# Exponent of the smooth maximum whose gradient replaces the gradient of a peak.
 SMOOTH_MAXIMUM_EXPONENT = 24
 
 
@@ -36,7 +36,7 @@ class Discrimination:
 
     Attributes:
         outputs: Runs of A and of B.
-        rival_fits: B fitted to the run of A, and A to that of B.
+        rival_fits: B fitted to the run of A, and A fitted to the run of B.
         counted: Which of the two directions count.
     """
 
@@ -46,21 +46,21 @@ class Discrimination:
 
     @property
     def nats(self) -> float:
-        """Expected log-likelihood by which the true model wins, in the less distinct direction [nat]."""
+        """Expected log-likelihood by which the true model wins, in the direction with less evidence [nat]."""
         return min(self._counted_nats)
 
     @property
     def mean_nats(self) -> float:
         """Geometric mean of the directions that count: the objective of an input optimisation [nat].
 
-        Where one direction is bounded, as that of a play by its size, the gradient of the smaller would
-        leave the other where it is.
+        The evidence of one direction may be bounded, for instance by the size of a play. The gradient of the
+        smaller evidence alone would then not improve the other direction.
         """
         return float(np.exp(np.mean(np.log(np.maximum(self._counted_nats, 1e-12)))))
 
     @property
     def _counted_nats(self) -> list[float]:
-        """Evidence of each direction that counts; zero where a fit failed, since then nothing is known."""
+        """Evidence of each direction that counts; zero if a fit failed, because then nothing is known."""
         pairs = zip(self.rival_fits, self.counted, strict=True)
         return [f.nats if np.isfinite(f.nats) else 0.0 for f, counts in pairs if counts]
 
@@ -72,9 +72,9 @@ class DiscriminationProblem:
     Attributes:
         pair: A and B.
         Ts: Sampling period [s].
-        limits: Of the machine.
-        variations: Other parameters that A may have, for the predicted peaks.
-        counted: Whether the run of A counts, and that of B: not one of a model that is nested in the other.
+        limits: Limits of the machine.
+        variations: Other parameter values that A may have, for the predicted peaks.
+        counted: Whether the run of A and the run of B count; the run of a nested model does not.
     """
 
     pair: tuple[RivalModel, RivalModel]
@@ -86,12 +86,12 @@ class DiscriminationProblem:
     def evaluate(
         self, u: Float[np.ndarray, " N"], last: Discrimination | None = None, thorough: bool = False
     ) -> Discrimination:
-        """Runs of both models, and each one fitted to the run of the other.
+        """Runs of both models, and each model fitted to the run of the other.
 
         Args:
             u: Voltage [V].
-            last: Result under a similar voltage, to start from.
-            thorough: Start from several shapes of the rival's effect too, and keep the best.
+            last: Result for a similar voltage, to start from.
+            thorough: Whether to start also from several shapes of the rival's effect, and keep the best fit.
         """
         runs = [free_run_from_rest(model, u, self.Ts) for model in self.pair]
         fits = []
@@ -104,14 +104,14 @@ class DiscriminationProblem:
         return Discrimination(np.array(runs), (fits[0], fits[1]), self.counted)
 
     def without_nested_direction(self, results: Sequence[Discrimination]) -> "DiscriminationProblem":
-        """The problem without a direction that no input can show.
+        """The problem without a direction that no input can distinguish.
 
-        Where one model is nested in the other (Coulomb friction in Stribeck's), or one effect is next to
-        nothing at the size that fits the other, the other reproduces every run of it; only the opposite
-        case shows in a recording.
+        If one model is nested in the other (Coulomb friction in Stribeck friction), or if its effect is
+        negligible at the size that fits the other, the other model reproduces every run of it. Only the
+        opposite direction can then be distinguished.
 
         Args:
-            results: Under inputs of many kinds.
+            results: Results for inputs of many kinds.
         """
         nats = np.array([[fit.nats for fit in result.rival_fits] for result in results])
         a, b = np.max(nats, axis=0, where=np.isfinite(nats), initial=0.0)
@@ -122,18 +122,18 @@ class DiscriminationProblem:
         return dataclasses.replace(self, counted=counted if any(counted) else (True, True))
 
     def relative_peaks(self, outputs: Float[np.ndarray, "2 N C"]) -> Float[np.ndarray, "2 C"]:
-        """Peak over limit, per model and channel."""
+        """Peak divided by its limit, for each model and channel."""
         return np.max(np.abs(outputs), axis=1) / self.limits.outputs(outputs.shape[-1])
 
     def gradient(
         self, u: Float[np.ndarray, " N"], result: Discrimination, penalty: Float[np.ndarray, "2 C"]
     ) -> Float[np.ndarray, " N"]:
-        """Gradient of `log(mean_nats) - sum penalty * log(peak)` along the voltage [1/V].
+        """Gradient of `log(mean_nats) - sum penalty * log(peak)` with respect to the voltage [1/V].
 
         Args:
             u: Voltage [V].
-            result: Evidence under it.
-            penalty: Weight of each model's peak in each channel.
+            result: Result for this voltage.
+            penalty: Weight of the peak of each model in each channel.
         """
         total = np.zeros_like(u)
         for k, fit in enumerate(result.rival_fits):
@@ -147,17 +147,17 @@ class DiscriminationProblem:
         return total
 
     def peaks(self, u: Float[np.ndarray, " N"]) -> Float[np.ndarray, " C"]:
-        """Largest |output| per channel under A, B, and A with other parameters."""
+        """Largest |output| of each channel in runs of A, of B, and of A with other parameters."""
         a, b = self.pair
         varied = [dataclasses.replace(a, mechanism=a.mechanism.with_values(v)) for v in self.variations]
         runs = [free_run_from_rest(model, u, self.Ts) for model in (a, b, *varied)]
         return np.max([np.max(np.abs(y), axis=0) for y in runs], axis=0)
 
     def scaled_to_limits(self, u: Float[np.ndarray, " N"]) -> Float[np.ndarray, " N"]:
-        """The voltage, made smaller until every predicted peak is within its limit.
+        """The voltage, reduced until every predicted peak is within its limit.
 
         Raises:
-            InputError: The machine leaves its limits almost without an input.
+            InputError: The machine leaves its limits even with almost no input.
         """
         for _ in range(30):
             peaks = self.peaks(u)
@@ -172,7 +172,7 @@ class DiscriminationProblem:
 
 
 def starts_with_other_shapes(rival: RivalModel) -> list[Float[np.ndarray, " D"]]:
-    """Starts of a rival fit with other shapes of the effect, one parameter changed at a time."""
+    """Starts of a rival fit with other shapes of the effect; one parameter is changed at a time."""
     effect = rival.effect()
     names, starts = rival.mechanism.parameter_names, []
     for name, value in effect.values.items():
@@ -189,26 +189,27 @@ def starts_with_other_shapes(rival: RivalModel) -> list[Float[np.ndarray, " D"]]
 
 Progress = Callable[[str], None]
 
-# Periods that are simulated for one evaluation: one from rest, the others near the periodic motion.
+# Periods that are simulated in one evaluation: one from rest, the others near the periodic motion.
 SIMULATED_PERIODS = 2
-# Penalty of a peak beyond its limit: zero within, quadratic up to this logarithm of the excess, then linear
-# with this weight. Evidence grows at most with the square of an input, so a weight above two suffices.
+# Penalty of a peak beyond its limit: zero within the limit, quadratic up to this logarithm of the excess,
+# then linear with this weight. Evidence grows at most with the square of an input, so a weight above two
+# suffices.
 PENALTY_WIDTH, PENALTY_WEIGHT = 0.04, 5.0
 MAX_EVALUATIONS = 60
-# Root mean square steps in units of the voltage limit, and the share of the last direction that is kept.
+# Root-mean-square steps in units of the voltage limit, and the share of the last direction that is kept.
 FIRST_ASCENT_STEP, SMALLEST_ASCENT_STEP, LONGEST_ASCENT_STEP, MOMENTUM = 0.3, 2e-3, 20.0, 0.5
-# Evaluations between those that start the rival fits from several shapes.
+# Number of evaluations after which the rival fits start from several shapes again.
 RESTART_INTERVAL = 20
 
 
 @dataclasses.dataclass(frozen=True)
 class PenalisedEvidence:
-    """The objective at one period of an input.
+    """The objective for one period of an input.
 
     Attributes:
         value: Logarithm of the mean evidence, less the penalties of peaks beyond their limits.
-        gradient: Along each sample of the period, per voltage limit.
-        result: Evidence of both directions under it.
+        gradient: Gradient with respect to each sample of the period, in units of the voltage limit.
+        result: Result for this input in both directions.
     """
 
     value: float
@@ -218,11 +219,11 @@ class PenalisedEvidence:
 
 @dataclasses.dataclass(frozen=True)
 class InputObjective:
-    """Evidence of a periodic input, penalised where predicted peaks leave the limits.
+    """Evidence of a periodic input, with a penalty if predicted peaks exceed the limits.
 
     Attributes:
         problem: Rival models and limits.
-        peak_factors: Factor by which other parameters of the model raise its peaks, per channel.
+        peak_factors: For each channel, factor by which other parameters of the model raise its peaks.
     """
 
     problem: DiscriminationProblem
@@ -231,9 +232,9 @@ class InputObjective:
     def voltage(
         self, x: Float[np.ndarray, " M"]
     ) -> tuple[Float[np.ndarray, " N"], Int[np.ndarray, " N"], Int[np.ndarray, " N"]]:
-        """The voltage [V] for a period in units of the limit, and the samples that each follows.
+        """The voltage [V] for a period in units of the limit, and the source samples of each sample.
 
-        The period's mean is taken off: a constant torque would make the machine drift.
+        The mean of the period is subtracted: a constant torque would make the machine drift.
         """
         p = self.problem
         repeated = np.tile(p.limits.voltage * (x - x.mean()), SIMULATED_PERIODS)
@@ -252,7 +253,7 @@ class InputObjective:
             quadratic**2 / (2 * PENALTY_WIDTH) + np.maximum(excess - PENALTY_WIDTH, 0.0)
         )
         g = p.gradient(u, result, PENALTY_WEIGHT * quadratic / PENALTY_WIDTH)
-        # A clipped sample does not follow its source; the gradient of the others goes back to theirs.
+        # The gradient of a sample is attributed to the samples of the period that determine it.
         by_source = (np.bincount(low, g, len(u)) + np.bincount(high, g, len(u))) / 2
         period = p.limits.voltage * by_source.reshape(SIMULATED_PERIODS, -1).sum(axis=0)
         value = np.log(result.mean_nats) - float(np.sum(penalty))
@@ -265,16 +266,16 @@ def optimise_input(
     evaluations: int = MAX_EVALUATIONS,
     progress: Progress | None = None,
 ) -> Float[np.ndarray, " M"]:
-    """One period [V] under which the two models are more distinct, from a start.
+    """One period [V] with which the two models are better distinguished than with the start.
 
-    Gradient ascent with momentum, clipped to the limit; a step that gains is lengthened, one that does not is
-    cut. Evidence grows with the square of an input, so the best inputs lie at the limits, where methods that
-    expect a smooth minimum make little progress.
+    The method is gradient ascent with momentum, clipped to the limit. The step is lengthened after a gain and
+    shortened otherwise. Evidence grows with the square of an input, so the best inputs are at the limits,
+    where methods that expect a smooth optimum make little progress.
 
     Args:
         problem: Rival models and limits.
-        period: Where to start [V].
-        evaluations: Evaluations at most.
+        period: Period at the start [V].
+        evaluations: Largest number of evaluations.
         progress: Called with a line of text now and then.
     """
     say = progress or (lambda _: None)

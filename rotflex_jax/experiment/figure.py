@@ -1,4 +1,4 @@
-"""The next experiment as a figure: what to play, its spectrum, and what it will show."""
+"""Figures of experiments: the input, its spectrum, and the predicted or recorded outputs."""
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -8,16 +8,17 @@ from rotflex_jax.experiment.result import Experiment, Segment, SequentialResult
 from rotflex_jax.text.colours import BASELINE, FAINT, FINAL, FURTHER, INK
 from rotflex_jax.text.plotting import blank, legend_above, plain_ticks, styled, thinned
 
-# Seconds of the input, and of the differences, that are drawn sample by sample.
+# Length of the input and of the differences that are drawn [s].
 INPUT_SECONDS, DIFFERENCE_SECONDS = 4.0, 1.0
 
 
 @styled
 def experiment_figure(e: Experiment) -> Figure:
-    """Input in time, its spectrum, and the predicted difference of the two hypotheses.
+    """Input over time, its spectrum, and the predicted difference of the two hypotheses.
 
-    The difference is what the best fit by the wrong effect leaves of a run, beside the band of two
-    standard deviations of the sensor noise. It may lie within the band at every sample: evidence adds up.
+    The difference is the residual of a run after the best fit with the wrong effect. It is drawn with a band
+    of two standard deviations of the sensor noise. It may be within the band at every sample, because
+    evidence adds up.
     """
     figure = blank(10.0, 2.6 + 1.7 * len(e.channels))
     axes = figure.subplots(1 + len(e.channels), 2, width_ratios=(1.7, 1.0), squeeze=False)
@@ -71,7 +72,7 @@ def _difference(ax: Axes, e: Experiment, c: int, channel: str) -> None:
 
 
 def _evidence(ax: Axes, e: Experiment, c: int, channel: str) -> None:
-    """Evidence of this channel as it adds up, correlation between channels left out."""
+    """Cumulative evidence of this channel, without the correlation between channels."""
     for k, colour, style in ((0, FINAL, "-"), (1, BASELINE, "--")):
         nats = np.cumsum((e.differences[k, :, c] / e.noise[channel]) ** 2) / 2
         ax.plot(*thinned(e.t, nats), color=colour, lw=1.4, ls=style)
@@ -87,7 +88,7 @@ def _rival_colours(count: int) -> tuple[str, ...]:
 
 @styled
 def segment_figure(s: Segment) -> Figure:
-    """The next input, and how what each model predicts for it differs from their mean."""
+    """The next input, and the difference of each model's prediction from the mean of all predictions."""
     figure = blank(10.0, 2.4 + 1.7 * len(s.channels))
     axes = figure.subplots(1 + len(s.channels), 1, sharex=True)
     axes[0].step(s.t, s.u, where="post", color=INK, lw=0.9)
@@ -106,7 +107,7 @@ def segment_figure(s: Segment) -> Figure:
 
 @styled
 def sequential_figure(r: SequentialResult) -> Figure:
-    """Probability of each model over the seconds on the rig, the voltage, and what was recorded."""
+    """Probability of each model over the time on the rig, the voltage, and the recorded outputs."""
     channels = r.runs[0].channels if r.runs else ()
     figure = blank(10.0, 4.2 + 1.5 * len(channels))
     axes = figure.subplots(2 + len(channels), 1, sharex=True, squeeze=False)[:, 0]

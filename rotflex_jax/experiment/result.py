@@ -1,4 +1,4 @@
-"""The next experiment: the input to play, the evidence it is expected to give, and the predicted motion."""
+"""Results: the input to play next, its expected evidence and predicted motion; sequential experiments."""
 
 import dataclasses
 import io
@@ -23,13 +23,13 @@ def voltage_file(
     """Write a voltage to play: a comment with the units, then `t,voltage`.
 
     Args:
-        path: Of the file.
+        path: Path of the file.
         u: Voltage [V].
         Ts: Sampling period [s].
-        purpose: What it is for, in the comment.
+        purpose: Purpose of the voltage, for the comment.
 
     Raises:
-        InputError: The folder does not exist, or the file cannot be written; an old one stays.
+        InputError: The folder does not exist, or the file cannot be written; an existing file stays as it is.
     """
     path = Path(path)
     if path.is_dir() or not path.absolute().parent.is_dir():
@@ -45,20 +45,20 @@ def voltage_file(
 
 
 def json_limits(limits: Limits) -> dict[str, float | None]:
-    """Limits as plain JSON, None where there is none."""
+    """Limits as plain JSON; None for a quantity without a limit."""
     return json_numbers(dataclasses.asdict(limits))
 
 
 @dataclasses.dataclass(frozen=True)
 class Rated:
-    """One input and the evidence that it is expected to give.
+    """One input and its expected evidence.
 
     Attributes:
         input: `noise`, `multisine`, `prbs`, `steps`, `sweep`, or `design`.
-        setting: Its parameters in words.
+        setting: Parameters of the input in words.
         nats: Log-likelihood by which the true model is expected to win, whichever it is [nat].
-        each: The same if the first is true, and if the second is [nat].
-        voltage: Peak [V].
+        each: This log-likelihood if the first model is true, and if the second model is true [nat].
+        voltage: Peak voltage [V].
         slew: Fastest change [V/s].
         peaks: Channel -> largest predicted |output|.
         settled: Whether the fits of the rival models have converged.
@@ -87,15 +87,15 @@ class Experiment:
         chosen: The input and its expected evidence.
         u: Voltage [V], held over each sample.
         Ts: Sampling period [s].
-        period: Time after which the input repeats [s]; its whole length where it does not.
-        table: Standard inputs beside the design, best first.
+        period: Time after which the input repeats [s]; its whole length if it does not repeat.
+        table: Standard inputs and designs, best first.
         numbers: Effect -> its parameters.
-        outputs: Runs if the first, or the second is true.
+        outputs: Runs if the first effect is true, and if the second effect is true.
         differences: Residuals of the rival fitted to each run, in units of the outputs.
         channels: Names of the outputs.
         noise: Channel -> standard deviation of the sensor noise.
         limits: Limits of the machine.
-        notes: What a reader must know before playing it.
+        notes: What the user must know before playing the input.
     """
 
     separates: tuple[str, str]
@@ -124,7 +124,7 @@ class Experiment:
 
     @property
     def evidence(self) -> dict[str, float]:
-        """Expected log-likelihood [nat] in total, and per second of the experiment."""
+        """Expected log-likelihood in total [nat], and per second of the experiment."""
         seconds = len(self.u) * self.Ts
         return {"nats": self.chosen.nats, "nats_per_second": self.chosen.nats / seconds}
 
@@ -136,7 +136,7 @@ class Experiment:
     def save_csv(self, path: str | os.PathLike[str]) -> Path:
         """Write the input: a comment with the units, then `t,voltage`.
 
-        Add the measured columns `theta` and `alpha` and `rotflex_jax.load` reads the file.
+        After you add the measured columns `theta` and `alpha`, `rotflex_jax.load` reads the file.
 
         Raises:
             InputError: The folder does not exist, or the file cannot be written; an old one stays.
@@ -144,7 +144,7 @@ class Experiment:
         return voltage_file(path, self.u, self.Ts, f"tells {one_line(' from '.join(self.separates))}")
 
     def plot(self) -> Any:
-        """Figure: input in time, its spectrum, predicted difference of the two against sensor noise."""
+        """Figure: input over time, its spectrum, and predicted difference of the models with sensor noise."""
         from rotflex_jax.experiment.figure import experiment_figure  # the layer above, on request
 
         return experiment_figure(self)
@@ -182,24 +182,25 @@ class Experiment:
 
 @dataclasses.dataclass(frozen=True)
 class Segment:
-    """The next seconds on the rig: the input after which a wrong answer is least probable.
+    """The next segment on the rig: the input after which a wrong answer is least probable.
 
     Attributes:
         rivals: Names of the models.
         u: Voltage [V], held over each sample.
         Ts: Sampling period [s].
         input: `noise`, `multisine`, `prbs`, `steps`, `sweep`, or `design`.
-        setting: Its parameters in words.
+        setting: Parameters of the input in words.
         nats: Entry (h, r): log-likelihood by which h is expected to win over r if h is true, after
-            `repeats` of it and for the worst of a few draws of the parameters [nat].
-        expected_error: Bound of the probability of a wrong answer after them, at most that before them.
-        probabilities: Of the models before it.
-        repeats: How often it is repeated in these numbers.
+            `repeats` repetitions of the input, for the worst of a few draws of the parameters [nat].
+        expected_error: Upper bound of the probability of a wrong answer after these repetitions; at most the
+            probability of a wrong answer before them.
+        probabilities: Probabilities of the models before the segment.
+        repeats: Number of repetitions of the input in `nats` and `expected_error`.
         peaks: Channel -> largest predicted |output|.
         table: Kind, setting and worth [nat] of the best inputs that were compared, best first.
-        tried: How many were compared.
-        limits: Of the machine.
-        outputs: Predicted by each model.
+        tried: Number of inputs that were compared.
+        limits: Limits of the machine.
+        outputs: Outputs predicted by each model.
         channels: Names of the outputs.
     """
 
@@ -233,7 +234,7 @@ class Segment:
         return voltage_file(path, self.u, self.Ts, f"tells {one_line(' from '.join(self.rivals))}")
 
     def plot(self) -> Any:
-        """Figure: the input, and what each model predicts for it less their mean."""
+        """Figure: the input, and the prediction of each model less the mean of all predictions."""
         from rotflex_jax.experiment.figure import segment_figure  # the layer above, on request
 
         return segment_figure(self)
@@ -275,11 +276,11 @@ class SequentialStep:
     Attributes:
         seconds: Time on the rig so far [s].
         input: Kind of the input.
-        setting: Its parameters in words.
-        voltage: Peak [V].
-        expected_error: Bound of the probability of a wrong answer that was expected beforehand.
-        probabilities: Name -> probability of each model now.
-        misfit: What the best model leaves, in units of the noise, at least 1.
+        setting: Parameters of the input in words.
+        voltage: Peak voltage [V].
+        expected_error: Upper bound of the probability of a wrong answer, as expected before the segment.
+        probabilities: Name -> probability of each model after the segment.
+        misfit: Residual of the best model in units of the noise, at least 1.
     """
 
     seconds: float
@@ -297,21 +298,21 @@ class SequentialStep:
 
 @dataclasses.dataclass(frozen=True)
 class SequentialResult:
-    """What a sequential experiment has shown.
+    """Result of a sequential experiment.
 
     Attributes:
         rivals: Names of the models.
         verdict: `decided`, `time is up`, `not distinguishable`, or `going on`.
         probabilities: Name -> probability of each model.
-        prior: The same before the first segment.
-        error: Probability of a wrong answer at which it stops.
-        max_seconds: Time at which it stops [s].
+        prior: Name -> probability of each model before the first segment.
+        error: Probability of a wrong answer at which the experiment stops.
+        max_seconds: Time at which the experiment stops [s].
         seconds: Time on the rig [s].
         history: One entry for each segment.
-        runs: What was played and recorded, each run without a pause.
-        limits: Of the machine.
-        reason: Why no experiment would decide, if so.
-        notes: What a reader must know.
+        runs: Recordings of the segments, each run without a pause.
+        limits: Limits of the machine.
+        reason: Reason if no experiment would decide, else empty.
+        notes: What the user must know.
     """
 
     rivals: tuple[str, ...]
@@ -373,7 +374,7 @@ class SequentialResult:
         }
 
     def plot(self) -> Any:
-        """Figure: probability over the seconds on the rig, the voltage, and what was recorded."""
+        """Figure: probabilities over the time on the rig, the voltage, and the recorded outputs."""
         from rotflex_jax.experiment.figure import sequential_figure  # the layer above, on request
 
         return sequential_figure(self)

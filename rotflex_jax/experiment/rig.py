@@ -1,4 +1,4 @@
-"""A machine on which voltages can be played: a class to derive from, and some that are ready."""
+"""Rigs, machines on which voltages can be played: a base class, and three ready-made classes."""
 
 import abc
 import time
@@ -21,13 +21,13 @@ from rotflex_jax.recording import Recording
 
 
 class Rig(abc.ABC):
-    """A machine on which voltages can be played; derive from it and write `play`.
+    """A machine on which voltages can be played; derive a class and implement `play`.
 
     Attributes:
-        limits: What the machine bears.
+        limits: Limits of the machine.
         Ts: Sampling period [s].
-        continues: Whether a segment begins in the motion with which the one before has ended. If not, the
-            machine comes to rest in between, and each segment has offsets and first states of its own.
+        continues: Whether a segment begins with the motion at the end of the segment before. If not, the
+            machine comes to rest in between, and each segment has its own offsets and first states.
     """
 
     limits: Limits
@@ -42,20 +42,20 @@ class Rig(abc.ABC):
             u: Voltage [V], each value held for one sampling period.
 
         Returns:
-            Outputs at the instants of the voltage, or a recording, whose voltage is then taken for what was
-            really applied.
+            Outputs at the sampling instants of the voltage, or a recording; the voltage of a recording is
+            taken as the one that was really applied.
         """
 
 
 class SimulatedRig(Rig):
-    """A model in the place of the machine, whose motion goes on from one segment to the next.
+    """A model in place of the machine; its motion continues from one segment to the next.
 
     Args:
-        model: The machine.
-        limits: What it bears.
+        model: Model of the machine.
+        limits: Limits of the machine.
         Ts: Sampling period [s].
         noise: Channel -> standard deviation of the sensor noise.
-        seed: Of the noise.
+        seed: Seed of the noise.
     """
 
     def __init__(
@@ -80,8 +80,8 @@ class SimulatedRig(Rig):
         self._rng, self._played = np.random.default_rng(checks.seed(seed)), np.zeros(0)
 
     def play(self, u: Float[np.ndarray, " N"]) -> Float[np.ndarray, "N C"]:
-        """Outputs with noise, from the motion in which the last segment has ended."""
-        # From the start each time: a delay or a drift remembers voltages, which no state holds.
+        """Outputs with noise, continuing the motion of the last segment."""
+        # From the start each time: a delay or a drift depends on earlier voltages, which are in no state.
         self._played = np.concatenate([self._played, checks.signal(u)])
         m = self.model.mechanism
         y = simulate(m, self._played, self.Ts, solver=self.model.solver)[-len(u) :]
@@ -89,13 +89,13 @@ class SimulatedRig(Rig):
 
 
 class CallbackRig(Rig):
-    """A rig that a function plays.
+    """A rig that is operated by a function.
 
     Args:
-        function: From the voltage [V] to the outputs, or to a recording.
-        limits: What the machine bears.
+        function: Function of the voltage [V] that returns the outputs, or a recording.
+        limits: Limits of the machine.
         Ts: Sampling period [s].
-        continues: Whether the motion goes on from one segment to the next.
+        continues: Whether the motion continues from one segment to the next.
     """
 
     def __init__(
@@ -114,19 +114,19 @@ class CallbackRig(Rig):
         self.Ts = checks.positive(Ts, "Ts", "s", "0.002")
 
     def play(self, u: Float[np.ndarray, " N"]) -> Recording | Float[np.ndarray, "N C"]:
-        """What the function returns."""
+        """The result of the function."""
         return self.function(u)
 
 
 class FileRig(Rig):
-    """A rig that is fed by files: `voltage_001.csv` is written, `recording_001.csv` is waited for.
+    """A rig that is operated by files: it writes `voltage_001.csv` and waits for `recording_001.csv`.
 
     Args:
-        folder: Where the files lie.
-        limits: What the machine bears.
+        folder: Folder of the files.
+        limits: Limits of the machine.
         Ts: Sampling period [s].
-        patience: How long a recording is waited for [s].
-        continues: Whether the motion goes on from one segment to the next.
+        patience: Longest wait for a recording [s].
+        continues: Whether the motion continues from one segment to the next.
         columns: Arguments of `rotflex_jax.load`, such as `degrees=True`.
     """
 
@@ -148,13 +148,13 @@ class FileRig(Rig):
         self.patience, self.columns, self._count = checks.positive(patience, "patience"), columns, 0
 
     def play(self, u: Float[np.ndarray, " N"]) -> Recording:
-        """Write the voltage, wait for the recording."""
+        """Write the voltage and wait for the recording."""
         self._count += 1
         answer = self.folder / f"recording_{self._count:03d}.csv"
         voltage_file(self.folder / f"voltage_{self._count:03d}.csv", u, self.Ts)
         ends = time.monotonic() + self.patience
         size = 0
-        # A file that still grows is being written.
+        # A file that still grows is still being written.
         while (now := answer.stat().st_size if answer.exists() else 0) == 0 or now != size:
             size = now
             if time.monotonic() > ends:
@@ -167,10 +167,10 @@ class FileRig(Rig):
 
 
 def checked_limits(limits: Any) -> Limits:
-    """Limits as they are.
+    """The limits, checked.
 
     Raises:
-        InputError: Something else.
+        InputError: The argument is no `Limits`.
     """
     if not isinstance(limits, Limits):
         raise InputError(

@@ -1,7 +1,8 @@
 """Two models that a recording cannot distinguish, and how well one can reproduce a run of the other.
 
-The rival B is fitted to a run of A by Gauss-Newton steps, each an exact linear least squares over all that a
-new recording leaves open: B's shape, every free parameter of the machine, first state, offset, bias.
+The rival B is fitted to a run of A by Gauss-Newton steps. Each step is an exact linear least-squares problem
+in all unknowns of a new recording: the shape parameters of B, every free parameter of the machine, first
+state, offset, bias.
 """
 
 import dataclasses
@@ -33,7 +34,7 @@ VOLTAGE_OFFSET = ("voltage_offset", "input")
 
 @dataclasses.dataclass(frozen=True)
 class RivalModel:
-    """One of two competing models, and which of its parameters a new recording leaves open.
+    """One of two competing models, and which of its parameters are unknown for a new recording.
 
     A fit to a new recording has D unknowns: unconstrained values of the free parameters, then the first
     state.
@@ -43,8 +44,8 @@ class RivalModel:
         mechanism: Fitted model with the effect and the calibrations of a recording.
         solver: Integration rule.
         free: Indices in `mechanism.values` of the parameters that are fitted to a new recording.
-        calibrations: Full names of the parameters that every recording has for itself.
-        K: Gain of the predictor; zero is a free run.
+        calibrations: Full names of the parameters that each recording has separately.
+        K: Gain of the predictor; zero for a free run.
         L: Inverse Cholesky factor of the covariance of the innovations.
     """
 
@@ -58,12 +59,12 @@ class RivalModel:
 
     @property
     def transform(self) -> Transform:
-        """Unconstrained <-> physical."""
+        """Transform between unconstrained and physical values."""
         return Transform.of(self.mechanism.parameter_specifications)
 
     @property
     def start(self) -> Float[np.ndarray, " D"]:
-        """Unknowns where a fit to a new recording starts: the model's own values, and a state at rest."""
+        """Start of a fit to a new recording: the values of the model, and a state at rest."""
         z = self.transform.unconstrain(self.mechanism.values)
         return np.concatenate([z[list(self.free)], np.zeros(2 * len(self.mechanism.coordinates))])
 
@@ -111,11 +112,11 @@ def rival_model(
 
     Args:
         model: Fitted model; may have one of the two effects.
-        effect: The effect: an instance with its parameters, `name@port` or a pair. A model that has it
-            gives the parameters, otherwise the catalogue does.
-        other: Effect and port of the rival, which is taken out.
+        effect: The effect: an instance with its parameters, `name@port` or a pair. Without an instance, the
+            parameters come from the model if it has the effect, otherwise from the catalogue.
+        other: Effect and port of the rival, which is removed.
         process_noise: Port -> intensity of the process torque [(N m)^2 s].
-        noise: Standard deviation of the sensor noise per channel.
+        noise: Standard deviation of the sensor noise of each channel.
         Ts: Sampling period [s].
     """
     name, port = effect_location(effect)
@@ -142,9 +143,9 @@ def rival_model(
 
 
 def with_calibrations(m: Mechanism) -> Mechanism:
-    """The mechanism with a voltage offset and sensor biases, which every recording has for itself.
+    """The mechanism with a voltage offset and sensor biases, which each recording has separately.
 
-    The first channel needs no bias: its first position is fitted.
+    The first channel needs no bias, because its first position is fitted.
     """
     locations = [VOLTAGE_OFFSET, *(("sensor_bias", c) for c in m.channels[1:])]
     for name, port in locations:
@@ -153,13 +154,14 @@ def with_calibrations(m: Mechanism) -> Mechanism:
     return m
 
 
-# A fit has converged when a further step promises less than this share of what is left, or this much [nat].
+# A fit has converged when the predicted gain of a further step is less than this share of the remaining cost,
+# or less than this [nat].
 GAIN_SHARE_TOLERANCE, GAIN_TOLERANCE = 2e-3, 0.01
 MAX_STEPS = 25
 # Directions weaker than this share of the strongest do not count in the exact projection.
 RANK_TOLERANCE = 1e-7
-# A short recording determines some of the unknowns hardly at all, and most steps are nearly exact: little
-# damping, raised fast where a step fails.
+# A short recording hardly determines some of the unknowns, and most steps are nearly exact: therefore little
+# damping, which is raised fast when a step fails.
 RULES = Rules(
     enough=GAIN_TOLERANCE / 2, enough_share=GAIN_SHARE_TOLERANCE / 2, damping=1e-6, increase=30.0, least=1e-9
 )
@@ -173,7 +175,7 @@ class RivalFit:
         unknowns: Unconstrained values of the free parameters, then the first state.
         nats: Half the squared whitened residuals that remain after an exact projection [nat].
         residuals: Whitened innovations of the rival on the run of the true model.
-        predicted_gain: What a further step would gain to first order [nat]; small at convergence.
+        predicted_gain: Gain of a further step to first order [nat]; small at convergence.
         steps: Gauss-Newton steps taken.
     """
 
@@ -185,7 +187,7 @@ class RivalFit:
 
     @property
     def converged(self) -> bool:
-        """Whether a further step would gain next to nothing."""
+        """Whether a further step would gain almost nothing."""
         return self.predicted_gain <= max(GAIN_SHARE_TOLERANCE * self.nats, GAIN_TOLERANCE)
 
 
@@ -211,7 +213,7 @@ def _rest_state(structure: Mechanism, like: jax.Array) -> jax.Array:
 
 @dataclasses.dataclass(frozen=True)
 class _StaticRival:
-    """What of a rival model is static in a compiled program."""
+    """The part of a rival model that is static in a compiled program."""
 
     structure: Mechanism
     solver: Solver
@@ -286,7 +288,7 @@ def fit_rival(
         u: Voltage [V].
         y: Outputs to reproduce.
         Ts: Sampling period [s].
-        start: Unknowns to start from; the rival's own if None.
+        start: Unknowns at the start; `rival.start` if None.
     """
     with double_precision():
         static, fixed = _static_and_arrays(rival)
@@ -328,7 +330,7 @@ class _Linearisation:
         return self._normal.predicted_decrease(step)
 
     def projected_cost(self) -> float:
-        """Half the squared residuals that an undamped step leaves to first order, by a triangular factor."""
+        """Half the squared residuals after an undamped step, to first order; from a triangular factor."""
         A, r = self.jacobian.reshape(self.residuals.size, -1), self.residuals.ravel()
         size = np.linalg.norm(A, axis=0)
         size = np.where(size > 0, size, 1.0)
@@ -345,7 +347,7 @@ def best_rival_fit(
     Ts: float,
     starts: Sequence[Float[np.ndarray, " D"]],
 ) -> RivalFit:
-    """The fit with the smallest residuals, of those from several starts; arguments as in `fit_rival`."""
+    """The fit with the smallest residuals, out of fits from several starts; arguments as in `fit_rival`."""
     return min((fit_rival(rival, u, y, Ts, start) for start in starts), key=lambda fit: fit.nats)
 
 
@@ -358,15 +360,15 @@ def input_gradient(
     evidence_weight: float = 1.0,
     output_weight: float | Float[np.ndarray, "N C"] = 0.0,
 ) -> Float[np.ndarray, " N"]:
-    """Gradient of `evidence_weight * nats + sum output_weight * y` along the voltage [1/V].
+    """Gradient of `evidence_weight * nats + sum output_weight * y` with respect to the voltage [1/V].
 
-    At the minimum over the rival's unknowns the gradient along them vanishes, so the gradient of the minimum
-    is that with the unknowns held.
+    At the minimum over the unknowns of the rival, the gradient along the unknowns is zero. Therefore the
+    gradient of the minimum equals the gradient with the unknowns held.
 
     Args:
         true: Model whose run is fitted.
-        rival: Model that is fitted to it.
-        unknowns: The rival's best unknowns under this voltage.
+        rival: Model that is fitted to this run.
+        unknowns: Best unknowns of the rival for this voltage.
         u: Voltage [V].
         Ts: Sampling period [s].
         evidence_weight: Factor of the evidence.

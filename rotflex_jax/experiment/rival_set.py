@@ -1,7 +1,7 @@
 """Several rival models in one structure: fitted to all recordings so far, with their probabilities.
 
-All effects of all models are built into one mechanism, and gates say which of them a model has, so that one
-compiled program serves every rival. What a recording says of a model is its evidence: the likelihood averaged
+All effects of all models are built into one mechanism, and gates select the effects of each model, so that
+one compiled program serves every rival. A recording gives an evidence for each model: the likelihood averaged
 over the parameters, first states and offsets that the model may have (Laplace's method).
 """
 
@@ -26,20 +26,21 @@ from rotflex_jax.parameters import Transform
 from rotflex_jax.runtime.persistent_jit import persistent_jit
 from rotflex_jax.runtime.xla import double_precision
 
-# What a run has for itself before anything of it is known: calibrations in units of their typical size,
-# positions and speeds in their own units. Wide, and the same for every rival.
+# Prior standard deviations of the unknowns of each run: of calibrations in units of their typical size, of
+# positions and speeds in their own units. They are wide, and the same for every rival.
 CALIBRATION_SPREAD, STATE_SPREAD = 5.0, 10.0
-# Other shapes of an effect that a fit starts from.
+# Factors of the shape parameters of an effect for further starts of a fit.
 SHAPE_FACTORS = (0.6, 1.6)
-# Rows of one call of a batched program; more are run in turn, fewer are filled up, so nothing compiles again.
+# Rows in one call of a batched program. More rows are run in turn, fewer are filled up, so that no further
+# program is compiled.
 BATCH = 16
-# Recordings are filled up to lengths that grow by this factor from the first.
+# Recordings are filled up to lengths that grow by this factor from the first length.
 LENGTH_FACTOR = 4
 
 
 @persistent_jit(static=2)
 def _run_with_slopes(structure, solver, values, gates, x0, K, u, y, Ts, place, dvalues, dx0):  # noqa: ANN001, ANN202
-    """Predicted outputs (N, C) and the state at a place (n,), each with slopes along the last axis."""
+    """Predicted outputs (N, C) and the state at a sample (n,), each with derivatives along the last axis."""
     seen = jnp.ones_like(u)
 
     def run(values: Array, x0: Array) -> tuple[Array, Array]:
@@ -60,7 +61,7 @@ def _outputs(structure, solver, values, gates, x0, u, Ts):  # noqa: ANN001, ANN2
 
 @persistent_jit(static=2)
 def _outputs_with_slopes(structure, solver, values, gates, x0, u, dvalues, dx0, Ts):  # noqa: ANN001, ANN202
-    """Outputs (N, C) of one run, and their slopes along the last axis."""
+    """Outputs (N, C) of one run, and their derivatives along the last axis."""
 
     def along(v: Array, x: Array) -> Any:
         run = lambda v, x: free_run(structure, solver, v, gates, x, u, Ts)[1]  # noqa: E731
@@ -71,13 +72,13 @@ def _outputs_with_slopes(structure, solver, values, gates, x0, u, dvalues, dx0, 
 
 @persistent_jit(static=2)
 def _input_slopes(structure, solver, values, gates, x0, u, weight, Ts):  # noqa: ANN001, ANN202
-    """Slope of a weighted sum of the outputs of one run along its voltage (N,)."""
+    """Gradient of a weighted sum of the outputs of one run with respect to its voltage (N,)."""
     run = lambda u: free_run(structure, solver, values, gates, x0, u, Ts)[1]  # noqa: E731
     return jax.grad(lambda u: jnp.sum(weight * run(u)))(u)
 
 
 class Start(NamedTuple):
-    """Rows of runs that begin in given states: parameter values, gates and first states of each."""
+    """Runs that begin in given states: parameter values, gates and first state of each, as rows."""
 
     values: Float[np.ndarray, "B P"]
     gates: Float[np.ndarray, "B E"]
@@ -85,7 +86,7 @@ class Start(NamedTuple):
 
 
 class RunData(NamedTuple):
-    """What the rig has played without a pause, and what was recorded."""
+    """Voltage that the rig played without a pause, and recorded outputs."""
 
     u: Float[np.ndarray, " N"]
     y: Float[np.ndarray, "N C"]
@@ -93,21 +94,21 @@ class RunData(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class RivalPosterior:
-    """What is known of one rival's parameters after some recordings.
+    """Posterior of the unknowns of one rival after some recordings.
 
-    The unknowns are the machine's free parameters (unconstrained), then for each run its calibrations and its
-    first positions and speeds.
+    The unknowns are the free parameters of the machine (unconstrained), then for each run its calibrations
+    and its first positions and speeds.
 
     Attributes:
         unknowns: Most probable values.
         cost: Half the squared whitened residuals [nat].
-        prior_cost: Half the squared distance from what was known before [nat].
-        gradient: Of both costs together along the unknowns.
+        prior_cost: Half the squared distance from the prior mean, weighted by the prior precision [nat].
+        gradient: Gradient of the sum of both costs along the unknowns.
         information: `J'J` of the whitened residuals.
-        precision: Diagonal blocks of what was known before.
+        precision: Precision of the prior.
         residuals: Whitened residuals of each run.
-        state: State in the last run at the place that was asked for.
-        state_slope: Its slope along machine parameters and what the last run has for itself.
+        state: State in the last run at the requested sample.
+        state_slope: Derivative of this state by the machine parameters and the unknowns of the last run.
     """
 
     unknowns: Float[np.ndarray, " D"]
@@ -121,7 +122,7 @@ class RivalPosterior:
     state_slope: Float[np.ndarray, "n A"]
 
     def log_evidence(self, scale: float) -> float:
-        """Logarithm of the averaged likelihood, constants common to all rivals left out [nat].
+        """Logarithm of the averaged likelihood, without constants that are common to all rivals [nat].
 
         Args:
             scale: Variance of the whitened residuals.
@@ -136,7 +137,12 @@ class RivalPosterior:
         )
 
     def covariance(self, scale: float, pick: Int[np.ndarray, " A"]) -> Float[np.ndarray, "A A"]:
-        """Covariance of some unknowns, all others averaged over."""
+        """Marginal covariance of some unknowns.
+
+        Args:
+            scale: Variance of the whitened residuals.
+            pick: Indices of the unknowns.
+        """
         whole = np.linalg.inv(self.information / scale + self.precision)[np.ix_(pick, pick)]
         return (whole + whole.T) / 2
 
@@ -147,16 +153,16 @@ class RivalSet:
 
     Attributes:
         labels: Names of the H models.
-        models: As they were given, each with what was known of its parameters beforehand.
-        structure: The mechanism with the effects of all of them.
+        models: The models as they were given, without effects that their gates switch off.
+        structure: The mechanism with the effects of all models.
         solver: Integration rule.
         gates: Which of the E effects each model has.
-        values: Parameter values of each.
-        free: Indices of the free parameters of each that belong to the machine.
-        own: Indices of the calibrations, which every run has for itself.
-        prior_mean: Unconstrained free parameters of each.
-        prior_covariance: Their covariance.
-        noise: Standard deviation of the sensor noise per channel.
+        values: Parameter values of each model.
+        free: For each model, indices of the free parameters that belong to the machine.
+        own: Indices of the calibrations, which each run has separately.
+        prior_mean: Prior mean of the unconstrained free parameters of each model.
+        prior_covariance: Covariance of these parameters.
+        noise: Standard deviation of the sensor noise of each channel.
         process_noise: Port -> intensity of the process torque [(N m)^2 s].
         Ts: Sampling period [s].
     """
@@ -189,7 +195,7 @@ class RivalSet:
 
     @property
     def run_unknowns(self) -> int:
-        """Unknowns that each run has for itself: calibrations, positions, speeds."""
+        """Number of unknowns that each run has separately: calibrations, positions, speeds."""
         return len(self.own) + 2 * self.layout.n
 
     @functools.cached_property
@@ -199,14 +205,17 @@ class RivalSet:
 
     @functools.cached_property
     def transform(self) -> Transform:
-        """Unconstrained <-> physical, of all parameters."""
+        """Transform between unconstrained and physical values of all parameters."""
         return Transform.of(self.structure.parameter_specifications)
 
     # -- whitening ---------------------------------------------------------------------------------
 
     @functools.cached_property
     def _filters(self) -> list[tuple[np.ndarray, np.ndarray, np.ndarray | None]]:
-        """Gain (n, C), inverse Cholesky factor (C, C), and `A, A K, C` where a predictor corrects."""
+        """Gain (n, C), inverse Cholesky factor (C, C), and linear part with gain, for each rival.
+
+        The last entry is None for a free run.
+        """
         found = []
         for model in self.models:
             m = with_calibrations(model.mechanism)
@@ -223,7 +232,7 @@ class RivalSet:
         return found
 
     def _impulse_response(self, h: int, M: int) -> np.ndarray | None:
-        """Response (M, C, C) of the innovations to a difference of the outputs; None where it is itself."""
+        """Response (M, C, C) of the innovations to a difference of the outputs; None if it is an identity."""
         linear = self._filters[h][2]
         if linear is None:
             return None
@@ -238,12 +247,12 @@ class RivalSet:
     def whitened(
         self, h: int, difference: Float[np.ndarray, "*B M C"], adjoint: bool = False
     ) -> Float[np.ndarray, "*B M C"]:
-        """Whitened innovations that a difference of the outputs makes under rival `h`, to first order.
+        """Whitened innovations of rival `h` for a difference of the outputs, to first order.
 
         Args:
             h: Number of the rival.
-            difference: What is measured less what the rival expects.
-            adjoint: The transposed operation, for gradients.
+            difference: Measured outputs less the outputs of the rival.
+            adjoint: Whether to apply the transposed operation, for gradients.
         """
         L, response = self._filters[h][1], self._impulse_response(h, difference.shape[-2])
         if response is None:
@@ -263,7 +272,7 @@ class RivalSet:
     def values_and_slopes(
         self, h: int, machine: Float[np.ndarray, "*B m"], own: Float[np.ndarray, "*B o"]
     ) -> tuple[Float[np.ndarray, "*B P"], Float[np.ndarray, "*B P"]]:
-        """Physical values, and the slope of each along its unconstrained coordinate."""
+        """Physical values, and the derivative of each with respect to its unconstrained coordinate."""
         shape = machine.shape[:-1]
         z = np.broadcast_to(self.transform.unconstrain(self.values[h]), (*shape, self.values.shape[1])).copy()
         z[..., self.free[h]], z[..., self.own] = machine, own
@@ -274,7 +283,7 @@ class RivalSet:
         return values, slope
 
     def _seeds(self, h: int, slope: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Directions of the unknowns of one run in values and first state, filled up to one number."""
+        """Directions of the unknowns of one run in values and first state, filled up to a common number."""
         widest = max(map(len, self.free)) + self.run_unknowns
         m, o, q = len(self.free[h]), len(self.own), 2 * self.layout.n
         dvalues = np.zeros((widest, len(slope)))
@@ -285,7 +294,7 @@ class RivalSet:
         return dvalues, dx0
 
     def _run(self, h: int, x: np.ndarray, run: RunData, place: int, length: int) -> tuple[np.ndarray, ...]:
-        """Whitened residuals (N, C), their slopes (N, C, A), a state and its slopes, for one run."""
+        """Whitened residuals (N, C) of one run, their derivatives (N, C, A), a state and its derivatives."""
         m, o = len(self.free[h]), len(self.own)
         values, slope = self.values_and_slopes(h, x[:m], x[m : m + o])
         dvalues, dx0 = self._seeds(h, slope)
@@ -314,14 +323,14 @@ class RivalSet:
     def posterior(
         self, h: int, unknowns: Float[np.ndarray, " D"], runs: Sequence[RunData], place: int, first: int
     ) -> RivalPosterior:
-        """What the runs say of rival `h` at some unknowns, without moving them.
+        """Costs, gradient and information of rival `h` at given unknowns.
 
         Args:
             h: Number of the rival.
-            unknowns: Of all runs.
-            runs: What was recorded.
+            unknowns: Unknowns of the machine and of all runs.
+            runs: Recorded runs.
             place: Sample of the last run whose state is wanted.
-            first: Shortest length that a program is compiled for.
+            first: Shortest length for which a program is compiled.
         """
         m, r = len(self.free[h]), self.run_unknowns
         D, machine = m + r * len(runs), np.arange(m)
@@ -361,7 +370,10 @@ class RivalSet:
         place: int,
         first: int,
     ) -> RivalPosterior:
-        """Rival `h` at its most probable unknowns given all runs, from several starts; as `posterior`."""
+        """Rival `h` at its most probable unknowns for all runs, from several starts.
+
+        Arguments as in `posterior`.
+        """
         m = len(self.free[h])
         limit = np.concatenate([np.full(m, LARGEST_STEP), np.full(len(starts[0]) - m, np.inf)])
 
@@ -376,13 +388,13 @@ class RivalSet:
         return self.posterior(h, best.x, runs, place, first)
 
     def first_unknowns(self, run: RunData) -> Float[np.ndarray, " r"]:
-        """What a run has for itself where its fit starts: no offset, the pose of its first sample."""
+        """Start values of the unknowns of a run: no calibrations, positions of its first sample, at rest."""
         n, rows = self.layout.n, np.array(self.layout.output_rows)
         q = np.linalg.lstsq(rows[:, :n], run.y[0], rcond=None)[0]
         return np.concatenate([np.zeros(len(self.own)), q, np.zeros(n)])
 
     def other_shapes(self, h: int, unknowns: Float[np.ndarray, " D"]) -> list[Float[np.ndarray, " D"]]:
-        """The same with other shapes of the effects that not every rival has, one parameter at a time."""
+        """The unknowns with other shapes of the effects that not every rival has, one parameter at a time."""
         names, found = self.structure.parameter_names, []
         shared = np.all(self.gates > 0, axis=0)
         for e, effect in enumerate(self.structure.effects):
@@ -419,9 +431,9 @@ class RivalSet:
         return jax.tree.map(lambda *a: np.concatenate(a), *parts)
 
     def _each(self, program: Any, rows: Sequence[np.ndarray]) -> Any:
-        """A program of one run over several, one after the other.
+        """Applies a program for one run to several runs, one after another.
 
-        Batches of batches of slopes crash as compiled by JAX 0.10 for a machine of one coordinate.
+        For a machine with one coordinate, nested batches of derivatives crash when compiled by JAX 0.10.
         """
         with double_precision():
             Ts, found = jnp.asarray(float(self.Ts)), []
@@ -441,18 +453,18 @@ class RivalSet:
         dvalues: Float[np.ndarray, "B D P"],
         dx0: Float[np.ndarray, "B D n"],
     ) -> tuple[Float[np.ndarray, "B M C"], Float[np.ndarray, "B M C D"]]:
-        """The same, and their slopes along directions of values and first states."""
+        """Outputs of free runs, and their derivatives along directions of values and first states."""
         return self._each(_outputs_with_slopes, (*start, u, dvalues, dx0))
 
     def input_slopes(
         self, start: Start, u: Float[np.ndarray, "B M"], weight: Float[np.ndarray, "B M C"]
     ) -> Float[np.ndarray, "B M"]:
-        """Slope of the weighted sum of the outputs along each sample of the voltage [1/V]."""
+        """Gradient of the weighted sum of the outputs with respect to each sample of the voltage [1/V]."""
         return self._each(_input_slopes, (*start, u, weight))
 
 
 def filled_length(N: int, first: int) -> int:
-    """The length that a recording of N samples is filled up to.
+    """The length to which a recording of N samples is filled up.
 
     >>> [filled_length(N, 500) for N in (500, 501, 2001)]
     [500, 2000, 8000]

@@ -1,4 +1,4 @@
-"""The next seconds of a sequential experiment: the input after which a wrong answer is least probable."""
+"""The next segment of a sequential experiment: the input after which a wrong answer is least probable."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -24,37 +24,39 @@ if TYPE_CHECKING:
 
 Progress = Callable[[str], None]
 
-# Voltage before a segment that its simulation begins with, for actuators that remember, and rest after it
-# within which the machine must stay inside its limits [s].
+# Length of the voltage before a segment with which its simulation begins, for actuators with memory, and
+# length of the rest after it during which the machine must stay within its limits [s].
 BEFORE, AFTER = 0.3, 0.3
-# An input is rated by what so many repetitions of it would show, since the first alone says as much of the
-# parameters as of the rival.
+# An input is rated by the evidence of this number of repetitions, because the first one alone carries as much
+# information on the parameters as on the rival.
 LOOK_AHEAD = 4
-# Draws from what is known of each rival's parameters; the worst counts for an input, the best for giving up.
+# Number of draws from the distribution of each rival's parameters. The worst draw counts for the rating of an
+# input, the best for giving up.
 DRAWS = 3
-# Share of a parameter's distance to its bound that a draw leaves.
+# Least share of the distance of a parameter to its bound that a draw leaves.
 LEFT_TO_BOUND = 0.2
 # Levels at which each standard input is tried, as shares of what the limits allow.
 LEVELS = (1.0, 0.4, 0.15, 0.06)
-# Motions of fewer standard deviations of the noise are not tried: the errors of a counter go on from sample
-# to sample there, and say far less than as many independent ones would.
+# Inputs whose motion has fewer standard deviations of the noise are not tried: there the rounding errors of
+# an encoder are correlated from sample to sample, and carry far less information than independent errors.
 QUIET = 20.0
-# Inputs that are improved by gradient, evaluations of each, and shares of the voltage limit of its steps.
+# Number of inputs that are improved by gradient ascent, evaluations of each, first step as a share of the
+# voltage limit, and share of the last direction that is kept.
 IMPROVED, LOOKS, FIRST_STEP, MOMENTUM = 4, 40, 0.3, 0.5
-# A log-likelihood ratio of mean T has the variance 2T: beyond so many deviations it is left out of account.
+# A log-likelihood ratio with mean T has the variance 2 T; luck beyond this many deviations is disregarded.
 DEVIATIONS = 2.0
-# Cuts by which an input is brought within the limits on motion.
+# Largest number of reductions that bring an input within the limits on motion.
 CUTS = 6
-# Inputs that a table lists.
+# Number of inputs in a table.
 LISTED = 8
-# Least share of the needed evidence that an input is rated with.
+# Least share of the needed evidence with which an input is rated.
 LEAST_SHARE = 1e-6
-# A shift of a logarithm beyond this is no longer a small change; the slope is then taken without it.
+# Shift of a logarithm above which it is no small change; the gradient is then taken without the shift.
 LARGEST_SHIFT = 1.0
 
 
 class SegmentChoice:
-    """Chooses the next segment from where an experiment stands."""
+    """Chooses the next segment from the state of an experiment."""
 
     def __init__(self, e: "SequentialExperiment") -> None:
         self.e, self.r, self.limits = e, e.rivals, e.settings.limits
@@ -65,12 +67,12 @@ class SegmentChoice:
         self._prepare()
 
     def _prepare(self) -> None:
-        """Where each rival's runs begin, along what they may be wrong, and draws of them."""
+        """Sets for each rival the first state and parameters of its runs, directions of errors, and draws."""
         r, e = self.r, self.e
         n, o, q = self.r.layout.size, len(r.own), 2 * r.layout.n
         goes_on = bool(e.runs) and e.settings.continues
         self.history = e.runs[-1].u[-self.before :] if goes_on else np.zeros(self.before)
-        # The next voltage follows the last one.
+        # The last voltage, from which the slew rate limits the next one.
         self.start = float(e.runs[-1].u[-1]) if goes_on else 0.0
         self.pose = e.runs[-1].y[0] if goes_on else np.zeros(len(r.structure.channels))
         values, x0, self.dvalues, self.dx0, self.information, self.nominal = [], [], [], [], [], []
@@ -115,9 +117,9 @@ class SegmentChoice:
         self.machine_own = [len(r.free[h]) + o + q for h in range(r.count)]
 
     def _likely(self, h: int, values: np.ndarray, change: np.ndarray) -> np.ndarray:
-        """Values of a draw: a change of physical values, of which some distance to a bound is left.
+        """Values of a draw: physical values after a change, at some distance from their bounds.
 
-        A logarithm that is hardly known would grow a small effect out of all proportion.
+        A change of a hardly known logarithm would enlarge a small effect out of all proportion.
         """
         out, lower, upper = values + change, self.r.transform.lower, self.r.transform.upper
         with np.errstate(invalid="ignore"):
@@ -129,7 +131,7 @@ class SegmentChoice:
     # -- runs --------------------------------------------------------------------------------------
 
     def _windows(self, U: np.ndarray) -> np.ndarray:
-        """Voltages with what was played before and rest after (B, W)."""
+        """Voltages (B, W) with the voltage played before them, and rest after them."""
         B = len(U)
         return np.concatenate([np.tile(self.history, (B, 1)), U, np.zeros((B, self.after))], axis=1)
 
@@ -137,7 +139,7 @@ class SegmentChoice:
         return Start(self.values[h], self.r.gates[h], self.x0[h])
 
     def outputs(self, U: Float[np.ndarray, "B M"], drawn: bool = False) -> Float[np.ndarray, "B H draws W C"]:
-        """Outputs (B, H, 1 or draws, W, C) from the segment on."""
+        """Outputs (B, H, 1 or draws, W, C) from the beginning of the segment on."""
         B, H = len(U), self.r.count
         windows, rows, values, x0 = self._windows(U), [], [], []
         for b in range(B):
@@ -152,7 +154,7 @@ class SegmentChoice:
         return y.reshape(B, H, -1, *y.shape[1:])
 
     def peaks(self, U: Float[np.ndarray, "B M"], drawn: bool = True) -> Float[np.ndarray, "B C"]:
-        """Largest |output| per channel (B, C), from the pose in which the run began, whichever is true."""
+        """Largest |output| of each channel (B, C) for any rival, relative to the first sample of the run."""
         runs = [self.outputs(U)] + ([self.outputs(U, drawn=True)] if drawn else [])
         most = [np.max(np.abs(y - self.pose), axis=(1, 2, 3)) for y in runs]
         return np.nan_to_num(np.max(most, axis=0), nan=np.inf)
@@ -160,7 +162,7 @@ class SegmentChoice:
     def within_limits(
         self, U: Float[np.ndarray, "B M"]
     ) -> tuple[Float[np.ndarray, "B M"], Bool[np.ndarray, " B"]]:
-        """Voltages cut down until predicted peaks are within the limits, and which of them are."""
+        """Voltages, reduced until predicted peaks are within the limits, and whether they are within them."""
         U, bound = U.copy(), self.limits.outputs(len(self.pose))
         ok = np.zeros(len(U), bool)
         for k in range(CUTS + 1):
@@ -175,7 +177,7 @@ class SegmentChoice:
         return U, ok
 
     def loud(self, U: Float[np.ndarray, "B M"]) -> Bool[np.ndarray, " B"]:
-        """Which inputs move some channel by far more than the noise; if none does, those that move most."""
+        """Which inputs move a channel by far more than the noise; if none does, those that move it most."""
         y = self.outputs(U)[..., : self.M, :]
         moved = np.nan_to_num(np.max(np.ptp(y, axis=-2) / self.r.noise, axis=(1, 2, 3)), nan=np.inf)
         return moved >= min(QUIET, moved.max() / 4)
@@ -185,21 +187,21 @@ class SegmentChoice:
     def evidence(
         self, U: Float[np.ndarray, "B M"], repeats: Sequence[float], drawn: bool, shift: bool = False
     ) -> tuple[Float[np.ndarray, "n B H draws H"], Any]:
-        """Expected log-likelihood by which h wins over r if h is true, after repeats of each input [nat].
+        """Expected log-likelihood by which h wins over r if h is true, after repetitions of each input [nat].
 
             c_r = min over d of  n/2 |L (y - y_r - J_r d)|^2 + 1/2 d' I_r d,     T = c_r - c_h
 
-        with `y` the run of h with its most probable parameters or with drawn ones, which h too must be
-        fitted to.
+        Here `y` is the run of h with its most probable parameters, or with drawn parameters, to which h must
+        be fitted too.
 
         Args:
             U: Voltages.
-            repeats: Numbers of repetitions n, below one for the first part of the input.
-            drawn: Whether the true parameters are drawn too.
-            shift: Whether the minimising `d` and residuals are wanted, for gradients.
+            repeats: Numbers of repetitions n; below one for the first part of the input.
+            drawn: Whether to use drawn true parameters too.
+            shift: Whether the minimising `d` and the residuals are wanted, for gradients.
 
         Returns:
-            (n, B, H, draws, H) and for each input and pair the residuals and `d`, if wanted.
+            T (n, B, H, draws, H), and for each input and pair the residuals and `d`, if wanted.
         """
         group, parts, details = max(1, BATCH // self.r.count), [], []
         for k in range(0, len(U), group):
@@ -223,7 +225,7 @@ class SegmentChoice:
         true = np.concatenate([y, self.outputs(U, drawn=True)[..., : self.M, :]], axis=2) if drawn else y
         out, details = np.zeros((len(repeats), B, H, true.shape[2], H)), [{} for _ in range(B)]
         root, C = math.sqrt(self.e.scale), y.shape[-1]
-        # Rows of the whitened outputs that each number of repetitions has, and its weight.
+        # For each number of repetitions: number of whitened outputs that it uses, and their weight.
         amounts = [(C * min(self.M, math.ceil(n * self.M - 1e-9)), max(n, 1.0)) for n in repeats]
         for b in range(B):
             for other in range(H):
@@ -242,7 +244,7 @@ class SegmentChoice:
                         out[i, b, h, :, other] = 0.5 * n * (c - np.sum(g * d.T, axis=1))
                     if shift and h != other:
                         left = e[0] - A @ d[:, 0]
-                        left[m:] = 0.0  # what comes later does not count
+                        left[m:] = 0.0  # later samples do not count
                         details[b][h, other] = (left.reshape(self.M, -1), d[:, 0])
         own = np.einsum("ibhdh->ibhd", out)
         out = np.nan_to_num(out - own[..., None], nan=0.0, posinf=0.0, neginf=0.0)
@@ -252,7 +254,7 @@ class SegmentChoice:
         return out, details
 
     def bound(self, T: Float[np.ndarray, "*B H H"]) -> Float[np.ndarray, "*B"]:
-        """Logarithm of a bound of the probability of a wrong answer, from evidence (..., H, H).
+        """Logarithm of an upper bound of the probability of a wrong answer, from evidence (..., H, H).
 
             sum over pairs of  sqrt(p_h p_r) exp(-T_hr / 4)
 
@@ -268,7 +270,7 @@ class SegmentChoice:
         return np.where(np.eye(self.r.count, dtype=bool), -np.inf, half - T / 4)
 
     def usefulness(self, T: Float[np.ndarray, "*B H H"]) -> Float[np.ndarray, "*B"]:
-        """Evidence (...,) that, if all pairs had it, would give the same bound [nat]."""
+        """Evidence (...,) that would give the same bound if all pairs had it [nat]."""
         return np.asarray(4 * (self.bound(np.zeros((self.r.count,) * 2)) - self.bound(T)))
 
     @property
@@ -280,14 +282,15 @@ class SegmentChoice:
     def seconds_until_decided(
         self, T: Float[np.ndarray, "n *B H H"], repeats: Sequence[float]
     ) -> Float[np.ndarray, "*B"]:
-        """Expected seconds until one model is decided, over the probabilities of the models.
+        """Expected time [s] until the experiment is decided, averaged over the probabilities of the models.
 
-        A model that is true is decided when its evidence is as large as is needed against each other one.
+        If a model is true, the experiment is decided when the evidence for it is large enough against each
+        other model.
 
         Args:
             T: Evidence after each number of repetitions, see `evidence`.
-            repeats: The numbers of repetitions, increasing; between them evidence grows linearly, beyond the
-                last as it did until then.
+            repeats: The numbers of repetitions, increasing. Evidence is taken as linear between them, and as
+                proportional to the number beyond the last.
         """
         need, other = self.needed, ~np.eye(self.r.count, dtype=bool)
         share = np.where(other & (need > 0), T / np.where(need > 0, need, 1.0), 1 / LEAST_SHARE).min(axis=-1)
@@ -296,7 +299,7 @@ class SegmentChoice:
         n, before, reached = last, (0.0, np.zeros_like(last)), np.zeros(last.shape, bool)
         for k, s in zip(repeats, share, strict=True):
             at = before[0] + (k - before[0]) * (1 - before[1]) / np.maximum(s - before[1], LEAST_SHARE)
-            # A decision is seen when what was recorded is evaluated.
+            # A decision is noticed only when the recording is evaluated.
             n = np.where(~reached & (s >= 1), np.maximum(at, repeats[0]), n)
             reached |= s >= 1
             before = (k, s)
@@ -305,7 +308,10 @@ class SegmentChoice:
     # -- choice ------------------------------------------------------------------------------------
 
     def _standard(self) -> list[tuple[str, str, np.ndarray]]:
-        """Standard inputs of one segment, new ones each time, at several levels."""
+        """Standard inputs for one segment with new random numbers, and the last design.
+
+        Each is a kind, a setting and a voltage.
+        """
         N, Ts, V, out = self.M, self.r.Ts, self.limits.voltage, []
         seed, top = int(self.rng.integers(2**31)), 0.4 / Ts
         low = max(0.5, 1 / (N * Ts))
@@ -331,7 +337,7 @@ class SegmentChoice:
         return out
 
     def best(self, say: Progress) -> tuple[Segment, str]:
-        """The segment that is expected to decide soonest, and why none would decide, if so."""
+        """The segment that is expected to decide soonest, and the reason if no segment would decide."""
         e, Ts = self.e, self.r.Ts
         named = self._standard()
         U = np.array([self.limits.playable(u, Ts, self.start) for *_, u in named])
@@ -402,16 +408,16 @@ class SegmentChoice:
         return tuple(sorted({*pieces, *more, float(min(LOOK_AHEAD, left)), left}))
 
     def _ahead(self, repeats: tuple[float, ...]) -> int:
-        """Which of the numbers of repetitions the worth of an input is of."""
+        """Index of the number of repetitions at which the worth of an input is computed."""
         return repeats.index(min(LOOK_AHEAD, repeats[-1]))
 
     def _rated(self, T: np.ndarray, repeats: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
-        """Expected seconds until it is decided, and worth [nat], of each input; the worst of the draws."""
+        """Expected time until a decision [s] and worth [nat] of each input, for the worst of the draws."""
         worst = T.min(axis=3)
         return self.seconds_until_decided(worst, repeats), self.usefulness(worst[self._ahead(repeats)])
 
     def _distinct(self, order: np.ndarray, named: list[Any]) -> list[int]:
-        """The best input of each of the best kinds."""
+        """Indices of the best input of each of the best kinds and settings."""
         chosen, kinds = [], set()
         for i in order:
             if named[i][:2] not in kinds:
@@ -422,10 +428,10 @@ class SegmentChoice:
         return chosen
 
     def _too_small(self, T: np.ndarray, left: float, tried: int, best: tuple[str, str]) -> str:
-        """Why no input would decide in the time that is left; empty if one may.
+        """Reason why no input would decide in the time that is left; empty if one may.
 
-        Whichever rival is true, some other stays possible even under the best input, the most favourable
-        parameters and a lucky draw of the noise.
+        The reason holds if, whichever rival is true, some other rival stays possible even with the best
+        input, the most favourable parameters and favourable noise.
         """
         p, error, H = self.p, self.e.settings.error, self.r.count
         alive = [h for h in range(H) if p[h] > error / (10 * H)]
@@ -455,7 +461,7 @@ class SegmentChoice:
     # -- improvement by gradient -------------------------------------------------------------------
 
     def _value_and_slope(self, X: np.ndarray, n: float) -> tuple[np.ndarray, np.ndarray]:
-        """Logarithm of the usefulness less penalties of peaks, and its slope along inputs per limit."""
+        """Logarithm of the usefulness less penalties of peaks, and its gradient per unit of the limit."""
         r, H, S, Ts = self.r, self.r.count, len(X), self.r.Ts
         voltage = self.limits.voltage
         played = [self.limits.playable_with_sources(voltage * x, Ts, self.start) for x in X]
@@ -514,7 +520,7 @@ class SegmentChoice:
         return value, np.array(out)
 
     def _moved(self, h: int, d: np.ndarray) -> tuple[int, np.ndarray, np.ndarray]:
-        """A rival with its unknowns shifted: its number, values and first state."""
+        """A rival with shifted unknowns: its number, values and first state."""
         m, o = len(self.r.free[h]), len(self.r.own)
         if np.any(np.abs(d[: m + o]) > LARGEST_SHIFT):
             d = np.zeros_like(d)
@@ -523,7 +529,7 @@ class SegmentChoice:
         return h, values, self.x0[h] + self.dx0[h][: len(d)].T @ d
 
     def _improved(self, U: np.ndarray, n: float) -> np.ndarray:
-        """Inputs after gradient ascent, several at once: a step that gains is lengthened, else cut."""
+        """Inputs after gradient ascent, several at once; a gain lengthens the step, otherwise it is cut."""
         x = np.clip(U / self.limits.voltage, -1.0, 1.0)
         value, g = self._value_and_slope(x, n)
         way, step = g.copy(), np.full(len(x), FIRST_STEP)

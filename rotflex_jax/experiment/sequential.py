@@ -1,8 +1,9 @@
-"""Experiments that stop by themselves: a few seconds are chosen, played and evaluated, until it is decided.
+"""Sequential experiments: segments of a few seconds are chosen, played and evaluated until it is decided.
 
-Each segment is the one after which the expected probability of a wrong answer is least; after each the
-rivals are fitted to everything recorded so far and their probabilities follow. It ends when one is probable
-enough (Wald's sequential test), when the time is up, or when no input within the limits would decide.
+Each segment is chosen so that the expected probability of a wrong answer after it is least. After each
+segment the rivals are fitted to everything recorded so far, which gives their probabilities. The experiment
+ends when one rival is probable enough (Wald's sequential test), when the time is up, or when no input within
+the limits would decide.
 """
 
 import dataclasses
@@ -33,29 +34,29 @@ Progress = Callable[[str], None]
 
 SEGMENT_SECONDS, MOST_SECONDS, ERROR = 1.0, 60.0, 0.01
 SHORTEST_SEGMENT = 0.4
-# Samples of the shortest piece that is evaluated by itself.
+# Number of samples of the shortest piece that is evaluated separately.
 SHORTEST_PIECE = 10
 KIND = "rotflex_jax sequential experiment"
-# Segments that are played before giving up, and times in turn that the gain must be too small.
+# Least number of segments that are played before giving up, and how often in a row the gain is too small.
 TRIED, IN_TURN = 2, 2
-# Segments after which fits start from other shapes of an effect too.
+# After the first segments, up to this number, fits start also from other shapes of an effect.
 SHAPES_AFTER = 3
 
 
 @dataclasses.dataclass(frozen=True)
 class SequentialSettings:
-    """How a sequential experiment is run.
+    """Settings of a sequential experiment.
 
     Attributes:
-        limits: What the machine bears.
+        limits: Limits of the machine.
         segment_seconds: Length of a segment [s].
-        error: Probability of a wrong answer at which it stops.
-        max_seconds: Time on the rig at which it stops [s].
-        continues: Whether the motion goes on from one segment to the next.
-        improve: Whether inputs are improved by gradient.
-        seed: Of standard inputs and draws.
-        check_seconds: Time after which what was recorded is evaluated [s]: a segment is played in pieces of
-            this length and broken off where it is decided. None for whole segments.
+        error: Probability of a wrong answer at which the experiment stops.
+        max_seconds: Time on the rig at which the experiment stops [s].
+        continues: Whether the motion continues from one segment to the next.
+        improve: Whether inputs are improved by gradient ascent.
+        seed: Seed of standard inputs and draws.
+        check_seconds: Interval at which the recording is evaluated [s]: a segment is played in pieces of this
+            length, and stopped early when it is decided. None for whole segments.
     """
 
     limits: Limits
@@ -70,20 +71,20 @@ class SequentialSettings:
 
 @dataclasses.dataclass(frozen=True)
 class SequentialExperiment:
-    """Where a sequential experiment stands; each step makes a new one.
+    """The state of a sequential experiment; each step returns a new state.
 
     Attributes:
         rivals: The models.
-        settings: How it is run.
-        prior: Probability of each before the first segment.
-        runs: What was played and recorded, each run without a pause.
+        settings: Settings of the experiment.
+        prior: Probability of each model before the first segment.
+        runs: Voltages and recorded outputs, each run without a pause.
         unknowns: Most probable unknowns of each rival.
         history: One entry for each segment.
-        too_small: Times in turn that no input promised to decide.
-        verdict: `decided`, `time is up`, `not distinguishable`, or empty while it goes on.
-        reason: What the verdict rests on where nothing was decided.
-        planned: The segment to play next, or of which the rest is to be played.
-        played: Samples of it that were played.
+        too_small: How often in a row no input was expected to decide.
+        verdict: `decided`, `time is up`, `not distinguishable`, or empty while the experiment continues.
+        reason: Reason of the verdict if nothing was decided.
+        planned: The segment to play next, or whose rest is to be played.
+        played: Number of samples of this segment that were played.
     """
 
     rivals: RivalSet
@@ -102,12 +103,12 @@ class SequentialExperiment:
 
     @property
     def samples(self) -> int:
-        """Samples of a segment."""
+        """Number of samples of a segment."""
         return round(self.settings.segment_seconds / self.rivals.Ts)
 
     @property
     def piece(self) -> int:
-        """Samples that are played before what was recorded is evaluated."""
+        """Number of samples that are played between two evaluations."""
         check = self.settings.check_seconds
         return self.samples if check is None else min(round(check / self.rivals.Ts), self.samples)
 
@@ -133,7 +134,7 @@ class SequentialExperiment:
 
     @functools.cached_property
     def posteriors(self) -> tuple[RivalPosterior, ...]:
-        """What is known of each rival after all recordings."""
+        """Posterior of each rival after all recordings."""
         place = max(0, len(self.runs[-1].u) - self._before)
         return tuple(
             self.rivals.posterior(h, x, self.runs, place, self.samples) for h, x in enumerate(self.unknowns)
@@ -141,9 +142,9 @@ class SequentialExperiment:
 
     @functools.cached_property
     def scale(self) -> float:
-        """Variance of the whitened residuals of the best rival, at least one, times their correlation.
+        """Variance of the whitened residuals of the best rival times their correlation time; at least one.
 
-        What no rival explains makes each of them less sure.
+        If no rival explains the recordings, all probabilities become less certain.
         """
         if not self.runs:
             return 1.0
@@ -170,7 +171,7 @@ class SequentialExperiment:
     # -- state of an experiment on disk ------------------------------------------------------------
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain JSON types, from which `from_dict` makes the same again, bit for bit."""
+        """Plain JSON types, from which `from_dict` restores the same experiment, bit for bit."""
         r, planned = self.rivals, self.planned
         return {
             "kind": KIND,
@@ -202,10 +203,10 @@ class SequentialExperiment:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> "SequentialExperiment":
-        """The experiment that `to_dict` described.
+        """The experiment from the result of `to_dict`.
 
         Raises:
-            InputError: It is none, or one of a later version.
+            InputError: The data are no sequential experiment, or from another version.
         """
         if not isinstance(data, Mapping) or data.get("kind") != KIND or data.get("schema") != 1:
             raise InputError(
@@ -255,16 +256,16 @@ class SequentialExperiment:
         """Write the state as JSON; `load` reads it.
 
         Raises:
-            InputError: The file cannot be written; an old one stays.
+            InputError: The file cannot be written; an existing file then stays as it is.
         """
         return write_file(path, json.dumps(self.to_dict(), allow_nan=False) + "\n")
 
     @classmethod
     def load(cls, path: str | Path) -> "SequentialExperiment":
-        """The state that `save` has written.
+        """The state from a file that `save` has written.
 
         Raises:
-            InputError: No such file, or none of a sequential experiment.
+            InputError: The file does not exist, or is not from a sequential experiment.
         """
         try:
             data = json.loads(Path(path).read_text(encoding="utf-8"))
@@ -281,7 +282,7 @@ class SequentialExperiment:
     # -- the next segment --------------------------------------------------------------------------
 
     def with_next_segment(self, progress: Progress | None = None) -> "SequentialExperiment":
-        """The same with the next segment planned, or with the verdict that none would decide."""
+        """The experiment with the next segment planned, or with the verdict that no segment would decide."""
         if self.verdict or self.planned is not None:
             return self
         segment, reason = SegmentChoice(self).best(progress or (lambda _: None))
@@ -293,19 +294,19 @@ class SequentialExperiment:
         return dataclasses.replace(self, too_small=too_small, planned=segment)
 
     def with_recording(self, recording: Recording | Float[np.ndarray, "N C"]) -> "SequentialExperiment":
-        """The same after the voltage that was due was played.
+        """The experiment after the voltage `due` was played.
 
         Args:
-            recording: Outputs at the instants of the voltage, or a recording.
+            recording: Outputs at the sampling instants of the voltage, or a recording.
 
         Raises:
-            InputError: No segment is planned, or what was recorded is not of it.
+            InputError: No segment is planned, or the recording does not belong to it.
         """
         if self.planned is None:
             raise InputError("A recording was given, but no segment is planned; plan the next one first.")
         run = _checked(recording, self.due, self.rivals)
         r, runs, N = self.rivals, self.runs, len(run.u)
-        # Two short pieces near rest may well be alike to the last count.
+        # Two short pieces near rest may be equal to the last count.
         whole = self.piece == self.samples
         known = [old.y[a : a + N] for old in runs for a in range(0, len(old.u), N) if whole]
         if np.ptp(run.y, axis=0).any() and any(np.array_equal(run.y, y) for y in known):
@@ -353,7 +354,7 @@ class SequentialExperiment:
         )
 
     def result(self) -> SequentialResult:
-        """What is known now, as a result. A first piece that is no recording yet is not among its runs."""
+        """The current state as a result; its runs exclude a first piece that is too short for a recording."""
         r, s = self.rivals, self.settings
         notes = []
         if self.history and self.scale > 4:
@@ -386,7 +387,7 @@ _ANYTHING = ("constant", "saturated")
 
 
 def _correlation_time(residuals: Sequence[np.ndarray]) -> float:
-    """Samples that say as much as one independent one, at least 1; of the most correlated channel.
+    """Number of samples that are worth one independent sample, at least 1, for the most correlated channel.
 
     Source: A. D. Sokal, Monte Carlo methods in statistical mechanics, 1997, section 3: the sum of the
     autocorrelation to five times itself.
@@ -405,7 +406,7 @@ def _correlation_time(residuals: Sequence[np.ndarray]) -> float:
 
 
 def _checked(recording: Any, due: np.ndarray, rivals: RivalSet) -> RunData:
-    """Voltage and outputs of what was due."""
+    """Voltage and outputs of the recording of the voltage `due`, checked."""
     N, channels = len(due), rivals.structure.channels
     if isinstance(recording, Recording):
         if abs(recording.Ts / rivals.Ts - 1) > 1e-3:
@@ -481,7 +482,7 @@ def sequential_experiment(
 
 
 def _prior(given: Any, labels: tuple[str, ...]) -> np.ndarray:
-    """Probabilities beforehand, in the order of the rivals; equal ones if none are given."""
+    """Prior probabilities in the order of the rivals; equal if none are given."""
     if given is None:
         return np.full(len(labels), 1 / len(labels))
     if isinstance(given, Mapping):

@@ -1,4 +1,4 @@
-"""Limits of a machine, and the standard inputs within them from which an experiment is chosen."""
+"""Limits of a machine, and standard inputs within these limits from which an experiment is chosen."""
 
 import dataclasses
 import math
@@ -13,17 +13,17 @@ from rotflex_jax.errors import InputError
 
 @dataclasses.dataclass(frozen=True)
 class Limits:
-    """What an experiment must not exceed.
+    """Limits that an experiment must not exceed.
 
-    Voltage and slew rate hold exactly. Travel and deflection are predicted by the models, so a margin is
-    kept; where the models are wrong, the machine may still go further.
+    The limits on voltage and slew rate hold exactly. Travel and deflection are predicted by the models, so a
+    margin is kept; if the models are wrong, the machine may still exceed these limits.
 
     Args:
         voltage: Largest |u| [V].
         slew: Largest change of the voltage per second [V/s].
-        travel: Largest |first channel| from its start, the servo angle [rad].
-        deflection: Largest |second channel|, the deflection of the arm [rad].
-        margin: Share of travel and deflection that is kept free for errors of the models.
+        travel: Largest distance of the first channel, the servo angle, from its start [rad].
+        deflection: Largest distance of the second channel, the deflection of the arm, from its start [rad].
+        margin: Share of travel and deflection that is reserved for errors of the models.
 
     >>> Limits(voltage=5.0, deflection=0.17).outputs(2)
     array([  inf, 0.153])
@@ -51,30 +51,30 @@ class Limits:
         return np.concatenate([known, np.full(channels - len(known), np.inf)])
 
     def playable(self, u: Float[np.ndarray, " N"], Ts: float, start: float = 0.0) -> Float[np.ndarray, " N"]:
-        """The voltage made to keep the limits on voltage and slew rate; unchanged where it does so already.
+        """The voltage within the limits on voltage and slew rate; unchanged if it is within them already.
 
-        Clipped, then the mean of the largest signal below and the smallest above that change no faster
-        than allowed (the envelopes of Pasch and Hausdorff). It can follow the voltage `start`, and 0 V can
-        follow it.
+        The voltage is clipped. The result is the mean of the largest signal below it and the smallest signal
+        above it that change no faster than allowed (the envelopes of Pasch and Hausdorff). It can follow the
+        voltage `start`, and 0 V can follow it.
 
         Args:
             u: Voltage [V].
             Ts: Sampling period [s].
-            start: Voltage of the sample before, from which 0 V is one step away at most [V].
+            start: Voltage of the sample before, limited to one step from 0 V [V].
         """
         return self.playable_with_sources(u, Ts, start)[0]
 
     def playable_with_sources(
         self, u: Float[np.ndarray, " N"], Ts: float, start: float = 0.0
     ) -> tuple[Float[np.ndarray, " N"], Int[np.ndarray, " N"], Int[np.ndarray, " N"]]:
-        """`playable(u)`, and for each of its samples the two samples of `u` whose mean it follows."""
+        """`playable(u)`, and for each sample the two samples of `u` that determine it, each by a half."""
         N = len(u)
         inside = np.clip(u, -self.voltage, self.voltage)
         if not math.isfinite(self.slew):
             k = np.arange(N)
             return inside, k, k
         step = self.slew * Ts * (1 - 1e-12)
-        # A start from which 0 V is further away counts as one step, so that the input scaled down follows it.
+        # A start further from 0 V counts as one step from it, so that a scaled-down input can follow it.
         start = min(max(start, -step), step)
         begins, ends = step * np.arange(1, N + 1), step * np.arange(N, 0, -1)
         inside = np.clip(inside, np.maximum(start - begins, -ends), np.minimum(start + begins, ends))
@@ -84,7 +84,7 @@ class Limits:
 
 
 def _lower_envelope(u: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
-    """min_j u[j] + step |k - j| for every k, and the j that gives it."""
+    """min_j u[j] + step |k - j| for every k, and the j of this minimum."""
     k = np.arange(len(u))
     after, j = _running_minimum(u - step * k)
     before, i = _running_minimum((u + step * k)[::-1])
@@ -94,15 +94,15 @@ def _lower_envelope(u: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]
 
 
 def _running_minimum(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Running minimum and where it was reached."""
+    """Running minimum, and the index at which it was reached."""
     least = np.minimum.accumulate(x)
     new = np.concatenate([[True], x[1:] < least[:-1]])
     return least, np.maximum.accumulate(np.where(new, np.arange(len(x)), 0))
 
 
-# Peak over root mean square: of Gaussian noise, which is clipped there, and of a multisine.
+# Crest factors (peak over root mean square) of Gaussian noise, which is clipped there, and of a multisine.
 NOISE_CREST, MULTISINE_CREST = 2.5, 1.7
-# Amplitudes at which the best inputs are rated again, as shares of what the limits allow.
+# Amplitudes at which the best inputs are rated again, as shares of the amplitude within the limits.
 REDUCED_AMPLITUDES = (0.5, 0.25)
 
 
@@ -112,7 +112,7 @@ class StandardInput:
 
     Attributes:
         kind: Name in `rotflex_jax.data.excitation`.
-        setting: Its parameters in words.
+        setting: Parameters of the input in words.
         u: Voltage [V].
     """
 
@@ -122,12 +122,12 @@ class StandardInput:
 
 
 def standard_inputs(N: int, Ts: float, limits: Limits) -> list[StandardInput]:
-    """Every standard input as large as the limits on voltage and slew rate allow, at several bandwidths.
+    """All standard inputs at several bandwidths, as large as the limits on voltage and slew rate allow.
 
     Args:
-        N: Samples.
+        N: Number of samples.
         Ts: Sampling period [s].
-        limits: Of the machine.
+        limits: Limits of the machine.
     """
     V, top, out = limits.voltage, 0.4 / Ts, []
 

@@ -38,41 +38,44 @@ def experiment_until(
 ) -> SequentialResult:
     """Experiment until it is decided which of several models is true.
 
-    A segment is chosen, played and recorded; each model is fitted to all that was recorded; and the
-    probabilities follow from the averaged likelihoods,
+    In each step a segment is chosen, played and recorded, and each model is fitted to everything recorded so
+    far. The probabilities follow from the averaged likelihoods,
 
         p_h ~ p_h0 * integral of p(y | parameters, h) p(parameters | h) over the parameters.
 
-    It stops when one has at least the probability `1 - error`: if one of the models is true, a wrong one is
-    then named with at most the probability `error`, averaged over the probabilities beforehand (Wald's test;
-    for two models of equal probability its thresholds are those of error rates `error` each way). It stops
-    too when the time is up, and when no input within the limits would decide in the time that is left.
+    The experiment stops when one model has at least the probability `1 - error`. If one of the models is
+    true, a wrong model is then named with at most the probability `error`, averaged over the prior
+    probabilities (Wald's test; for two models of equal probability its thresholds are those for error rates
+    of `error` in both directions). The experiment also stops when the time is up, or when no input within the
+    limits would decide in the time that is left.
 
-    Not where none of the models is near the machine: probabilities are among those given.
+    Not if none of the models is near the machine: the probabilities hold among the given models only.
 
     Args:
         models: Name -> `Fit`, `Model` or `Mechanism`, or a list of them; or the result of a search, whose
-            probable sets of effects are fitted. A `Fit` says how well its parameters are known.
-        rig: Plays voltages, and has the limits.
-        probabilities: Of each model beforehand; equal if None, those of the search if there are some.
-        error: Probability of a wrong answer at which it stops.
-        max_seconds: Time on the rig at which it stops [s].
+            probable sets of effects are fitted. A `Fit` has the uncertainty of its parameters.
+        rig: Rig that plays the voltages and has the limits.
+        probabilities: Prior probability of each model. If None, the probabilities of the search, or equal
+            ones without a search.
+        error: Probability of a wrong answer at which the experiment stops.
+        max_seconds: Time on the rig at which the experiment stops [s].
         segment_seconds: Length of a segment [s].
-        check_seconds: Time after which what was recorded is evaluated [s]: on a rig whose motion goes on, a
-            segment is played in pieces of this length and broken off where it is decided. None for whole
+        check_seconds: Interval at which the recording is evaluated [s]: on a rig whose motion continues, a
+            segment is played in pieces of this length, and stopped early when it is decided. None for whole
             segments.
-        noise: Channel -> standard deviation of the sensor noise; that of the fits if None.
+        noise: Channel -> standard deviation of the sensor noise; from the fits if None.
         process_noise: Port -> intensity of the process torque [(N m)^2 s]; None for free runs.
-        uncertainty: Standard deviation of parameters that come without one, as a share of their value.
-        improve: Whether inputs are improved by gradient, or standard ones played.
-        seed: Of standard inputs and draws.
+        uncertainty: Standard deviation of parameters for which none is known, as a share of their value.
+        improve: Whether inputs are improved by gradient ascent; otherwise standard inputs are played.
+        seed: Seed of standard inputs and draws.
         progress: Called with a line of text now and then.
 
     Returns:
         SequentialResult.
 
     Raises:
-        InputError: No rig, fewer than two models, no noise, or a recording that does not fit.
+        InputError: There is no rig, there are fewer than two models, the noise is not known, or a recording
+            does not fit the voltage.
 
     Source: A. Wald, Sequential tests of statistical hypotheses, Annals of Mathematical Statistics 16, 1945;
         C. W. Baum and V. V. Veeravalli, A sequential procedure for multihypothesis testing, IEEE Trans.
@@ -112,26 +115,26 @@ def experiment_until(
     return e.result()
 
 
-# Sets of effects of a search that are less probable than this are left out, and at most so many are fitted.
+# Least probability of a set of effects of a search that is fitted, and largest number of sets.
 LEAST_PROBABLE, MOST_SETS = 0.02, 5
 
 
 def models_of(given: Any, say: Progress) -> tuple[Any, Mapping[str, float] | None]:
-    """Models as they are; of a search's result the probable sets, fitted to its recordings.
+    """The models unchanged; for the result of a search, its probable sets, fitted to its recordings.
 
     Args:
-        given: As `models` in `experiment_until`.
-        say: Told what is fitted.
+        given: The argument `models` of `experiment_until`.
+        say: Called with a line of text for each fit.
 
     Returns:
-        Models, and name -> probability where the search had some.
+        Models, and name -> probability if they come from a search, else None.
     """
     known, train = getattr(given, "probabilities", None), getattr(given, "train", None)
     if known is None or not train:
         return given, None
     check_input_alone(given.final.model.mechanism, "a designed experiment")
     models, found = {}, {}
-    # The model to use may have another law in the place of one that was found (`FinalFit.laws`).
+    # The final model may have another law in place of one that was found (`FinalFit.laws`).
     fitted = (*given.final.model.mechanism.effects, *given.model.mechanism.effects)
     final = {(e.name, e.at): e for e in fitted}
     for s in known.sets[:MOST_SETS]:

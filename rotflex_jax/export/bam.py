@@ -1,4 +1,4 @@
-"""A servo as the parameter file of Better Actuator Models (BAM), which MuJoCo and Isaac users read."""
+"""Export of a servo to a parameter file of Better Actuator Models (BAM), for users of MuJoCo and Isaac."""
 
 import json
 import math
@@ -26,7 +26,7 @@ from rotflex_jax.joints.servos import FREE_FALL
 from rotflex_jax.mechanism import Mechanism
 from rotflex_jax.models.model import Model
 
-# Step of the certificate's simulation by the equations of BAM [s], at most.
+# Largest step of the simulation with the equations of BAM, for the certificate [s].
 _LONGEST_STEP = 1e-4
 
 _MODELS = {(False, False): "m1", (True, False): "m2", (False, True): "m3", (True, True): "m4"}
@@ -43,24 +43,26 @@ def to_bam(
 
         motor = kt/R (supply duty - kt q'),   friction up to friction_base + friction_viscous |q'| + ...
 
-    M1 for Coulomb and viscous friction, M2 with Stribeck friction, M3 with friction that grows with the load,
-    M4 with both. BAM knows the pendulum apart from the servo: its inertia and weight are those of a mass at
-    `length`, and what is left of the inertia is the servo's (`armature`). Gain, supply and limit of the duty
-    stand in their class of the actuator, not in the file: they are listed with their values.
+    The friction model is M1 for Coulomb and viscous friction, M2 with Stribeck friction, M3 with friction
+    that grows with the load, and M4 with both. BAM separates the pendulum from the servo: the pendulum has
+    the weight and inertia of a mass at `length`, the rest of the inertia is the servo's (`armature`). BAM
+    keeps gain, supply and limit of the duty in the class of the actuator, not in the file. The certificate
+    lists them with their values.
 
     Args:
         model: Mechanism of one coordinate with a `PositionLoop`, or a Model.
         Ts: Sampling period of the certificate's input [s].
         actuator: Name of the class of the actuator in BAM.
-        length: Of the pendulum [m], where the servo lifts a weight.
+        length: Length of the pendulum [m], if the servo lifts a weight.
         u: Input of the certificate: goals [rad]; None for three sines with rests.
 
     Returns:
-        The text of the JSON file with its certificate: the equations of BAM, written a second time and
-        stepped finely, against the toolkit. JSON has no comments, so the certificate is not in the file.
+        The text of the JSON file, with a certificate that compares a simulation by the equations of BAM at
+        fine steps with the toolkit. JSON has no comments, so the file does not contain the certificate.
 
     Raises:
-        InputError: No servo, a pendulum that is heavier than the inertia; no sampling period, no signal.
+        InputError: The model has no servo, or less inertia than the pendulum; `Ts` is no sampling period, or
+            `u` no signal.
 
     Source: M. Duclusaud, G. Passault, V. Padois and O. Ly, Extended friction models for the physics
     simulation of servo actuators, 2024, arXiv 2410.08650; parameter files of the repository Rhoban/bam.
@@ -140,7 +142,7 @@ def _parameters(
             else:
                 driving, driven = effect.driving, effect.driven
             content["friction_base"] += effect.level
-            # BAM's torque through the gear is the sum of both sides, ours their mean.
+            # The load in BAM is the sum of the torques on both sides of the gear, here it is their mean.
             content["load_friction_base"] = (driving + driven) / 4
             if driving != driven:
                 approximated.append(f"{label(effect)}: the mean of both shares")
@@ -166,13 +168,13 @@ def run_by_bam_equations(
 ) -> Float[np.ndarray, "N 1"]:
     """Angle of the servo by the equations of BAM, from rest at zero.
 
-        inertia q'' = motor + load - clip(what stops it within the step, -budget, budget)
+        inertia q'' = motor + load - clip(torque that stops the servo within the step, -budget, budget)
 
     Args:
-        parameters: What a parameter file holds.
-        servo: Its firmware.
-        weight: Sine and cosine of the weight [N m].
-        length: Of the pendulum [m].
+        parameters: Contents of a parameter file.
+        servo: Position loop of the servo, for its firmware and supply.
+        weight: Sine and cosine amplitudes of the weight [N m].
+        length: Length of the pendulum [m].
         u: Goals, held over each sample [rad].
         Ts: Sampling period [s].
     """

@@ -1,7 +1,7 @@
 """A fitted model as C code for a controller: one header, C99, no dynamic memory, double precision.
 
-The code is unfolded from the same functions that the simulator runs, with all constants of the model
-evaluated beforehand. Effects that a user defines are included automatically.
+The code is generated from the same functions that the simulator runs, with all constants of the model
+evaluated beforehand. Effects that a user defines are therefore included automatically.
 """
 
 import re
@@ -21,7 +21,7 @@ from rotflex_jax.models.model import Model
 from rotflex_jax.parameters import specifications
 from rotflex_jax.text.numbers import one_line
 
-# Characters: a longer expression gets a variable of its own even if it is used once.
+# Length [characters] above which an expression gets a variable of its own even if it is used once.
 _LONGEST_EXPRESSION = 90
 
 
@@ -34,8 +34,8 @@ def to_c(model: Mechanism | Model, Ts: float, prefix: str = "rotflex") -> str:
 
     `rotflex_read(&s, y)` gives the outputs without a step.
 
-    It agrees with `Model.simulate` to rounding. Not for another sampling period: its matrix exponential
-    holds for `Ts`.
+    The outputs agree with `Model.simulate` to rounding. The code is valid for the sampling period `Ts` only,
+    since its matrix exponential is evaluated beforehand.
 
     Args:
         model: Mechanism with its parameter values, or a Model.
@@ -46,7 +46,8 @@ def to_c(model: Mechanism | Model, Ts: float, prefix: str = "rotflex") -> str:
         The text of a header that contains everything; functions are `static`.
 
     Raises:
-        InputError: An effect that C code cannot express, by name; an invalid sampling period or prefix.
+        InputError: C code cannot express an effect, which the message names; the sampling period or the
+            prefix is invalid.
     """
     model, Ts = Model.of(model), positive(Ts, "Ts", example="0.002")
     check_input_alone(model.mechanism, "C code")
@@ -69,7 +70,7 @@ def _number(value: Operand) -> str:
 
 
 class _Printer:
-    """Statements for expressions, each written once."""
+    """Writes C statements for expressions, each expression once."""
 
     def __init__(self, leaf: Callable[[Expression], str], roots: list[Operand]) -> None:
         self.leaf, self.text, self.count = leaf, {}, 0
@@ -83,7 +84,7 @@ class _Printer:
                 self.uses[r] = self.uses.get(r, 0) + 1
 
     def statements(self, roots: list[Operand]) -> Iterator[str]:
-        """Statements that must precede the use of the roots."""
+        """Statements that must precede the use of the expressions `roots`."""
         for e in ordered(roots):
             if e in self.text:
                 continue
@@ -104,7 +105,7 @@ class _Printer:
 
 
 def _bare(text: str) -> str:
-    """Without brackets around the whole."""
+    """The expression without brackets around the whole."""
     if not (text.startswith("(") and text.endswith(")")):
         return text
     depth = 0
@@ -175,12 +176,12 @@ def _heading(mechanism: Mechanism, model: Model, Ts: float) -> Iterator[str]:
 
 
 def in_c_comment(text: str) -> str:
-    """A text in which no comment of C ends, on one line: names may come from a file."""
+    """A text on one line that cannot end a comment in C; names may come from a file."""
     return one_line(text).replace("\\", "/").replace("*/", "* /").replace("/*", "/ *")
 
 
 def _sequence_states(code: SampleProgram) -> tuple[list[Expression], list[Expression], bool]:
-    """First commands, delayed commands and whether samples are counted, from the command to the voltage."""
+    """States that the actuation needs: first commands, delayed commands, whether samples are counted."""
     roots = [code.voltage, *(m.start for m in code.sequence_states), *(m.next for m in code.sequence_states)]
     below = list(ordered(roots))
     found = {op: [e for e in below if e.op == op] for op in ("first", "past", "count")}
@@ -195,7 +196,7 @@ def _reading(code: SampleProgram) -> Iterator[str]:
 
 
 def _driving(code: SampleProgram, firsts: list[Expression], pasts: list[Expression]) -> Iterator[str]:
-    """The voltage `v` from the command, with the states of the actuation updated."""
+    """Statements for the voltage `v` from the command, and for the next states of the actuation."""
     roots = [code.voltage, *(m.next for m in code.sequence_states)]
     starts = [m.start for m in code.sequence_states]
 

@@ -1,4 +1,4 @@
-"""What an export to a simulator is worth: simulated against the toolkit, and what could not be said."""
+"""Certificates of exports: the difference of a simulator from the toolkit, and what its format lacks."""
 
 import dataclasses
 import os
@@ -17,7 +17,7 @@ from rotflex_jax.models.model import Model
 from rotflex_jax.text.files import write_file
 from rotflex_jax.text.numbers import one_line
 
-# Amplitude of the input that a certificate is given on, by the unit of the input.
+# Unit of the input -> amplitude of the standard input of certificates.
 _AMPLITUDES = {"V": 2.0, "rad": 0.6, "A": 0.5}
 
 _SECONDS = 5.0
@@ -25,20 +25,20 @@ _SECONDS = 5.0
 
 @dataclasses.dataclass(frozen=True)
 class Certificate:
-    """An export simulated by another program, against the toolkit on the same input.
+    """Comparison of an export, simulated by another program, with the toolkit on the same input.
 
     Attributes:
-        form: Form of the export, such as `MJCF`.
-        simulated_by: Program that simulated the exported file; empty where none did.
-        not_simulated: Why none did; empty where one did.
+        form: Format of the export, such as `MJCF`.
+        simulated_by: Program that simulated the exported file; empty if none did.
+        not_simulated: Why no program simulated the file; empty if one did.
         on: The input, in words.
         channels: Names of the outputs.
-        units: Their units.
+        units: Units of the outputs.
         largest: Largest difference per channel [unit of the channel].
         rms: Root mean square difference per channel [unit of the channel].
-        spans: How far each channel moves in the toolkit's run, largest less smallest.
-        left_out: What the form cannot say, by name, with the reason.
-        approximated: What it says otherwise than the toolkit.
+        spans: Range of each channel in the toolkit's run, largest less smallest [unit of the channel].
+        left_out: Effects and readings that the format cannot represent, with the reason.
+        approximated: Effects that the export represents in a different way.
     """
 
     form: str
@@ -75,35 +75,35 @@ class Certificate:
 
 @dataclasses.dataclass(frozen=True)
 class Exported:
-    """A model in the form of a simulator, with its certificate.
+    """A model in the format of a simulator, with its certificate.
 
     Attributes:
-        content: What goes into the file: text, or bytes.
-        certificate: How well the simulator follows the toolkit with it.
+        content: Content of the file: text, or bytes.
+        certificate: Comparison of the simulator with the toolkit.
     """
 
     content: str | bytes
     certificate: Certificate
 
     def save(self, path: str | os.PathLike[str]) -> Path:
-        """Write the file.
+        """Writes the file and returns its path.
 
         Raises:
-            InputError: It cannot be written.
+            InputError: The file cannot be written.
         """
         return write_file(path, self.content)
 
 
 @dataclasses.dataclass(frozen=True)
 class Subject:
-    """What is exported, and how its certificate is made.
+    """A model to be exported, and the input of its certificate.
 
     Attributes:
         model: The model without effects that are switched off.
         Ts: Sampling period [s].
         u: Input of the certificate, held over each sample.
-        on: That input in words.
-        left_out: Readings that the form has not.
+        on: The input in words.
+        left_out: Readings that the format cannot represent.
     """
 
     model: Model
@@ -116,10 +116,11 @@ class Subject:
     def of(
         cls, model: Mechanism | Model, Ts: float, u: Real[np.ndarray, " N"] | Sequence[float] | None
     ) -> "Subject":
-        """Checked arguments of an export.
+        """A subject from the arguments of an export, which are checked.
 
         Raises:
-            InputError: No model, no sampling period, no finite signal, effects that are on in part.
+            InputError: An argument is no model, no sampling period or no finite signal, or a gate is neither
+                0 nor 1.
         """
         model, Ts = Model.of(model), positive(Ts, "Ts", example="0.002")
         check_input_alone(model.mechanism, "an exported model")
@@ -147,7 +148,7 @@ class Subject:
         return self.model.mechanism
 
     def of_motion(self) -> "Subject":
-        """The same without readings of a motor, for forms whose sensors show motions alone."""
+        """The subject without readings of a motor, for formats whose sensors measure motions only."""
         m = self.mechanism
         others = {c: pair for (c, pair), q in zip(m.outputs, m.quantities, strict=True) if q.of_motion}
         if len(others) == len(m.outputs):
@@ -169,15 +170,15 @@ class Subject:
         approximated: Sequence[str] = (),
         why_not: str = "",
     ) -> Certificate:
-        """The certificate for what the other program gave.
+        """The certificate from the outputs of another program.
 
         Args:
-            form: Form of the export.
-            simulated_by: The program.
-            y: What it gave from rest, or None where nothing ran.
-            left_out: What the form cannot say.
-            approximated: What it says otherwise.
-            why_not: Why nothing ran.
+            form: Format of the export.
+            simulated_by: Name of the program.
+            y: Outputs of the program from rest, or None if it did not run.
+            left_out: Effects that the format cannot represent.
+            approximated: Effects that the export represents in a different way.
+            why_not: Reason why the program did not run.
         """
         m = self.mechanism
         units = tuple(q.unit(m.units) for q in m.quantities)
@@ -204,11 +205,11 @@ class Subject:
 
 
 def standard_input(Ts: float, size: float) -> Float[np.ndarray, " N"]:
-    """The input that certificates are given on: three sines, two rests, in which dry friction holds.
+    """Standard input of certificates: three sines, with two constant stretches for dry friction to hold in.
 
     Args:
         Ts: Sampling period [s].
-        size: Largest value [unit of the input].
+        size: Bound of the magnitude [unit of the input].
     """
     t = Ts * np.arange(max(round(_SECONDS / Ts), 2))
     u = (
@@ -222,7 +223,7 @@ def standard_input(Ts: float, size: float) -> Float[np.ndarray, " N"]:
 
 
 def label(effect: Effect) -> str:
-    """An effect as certificates name it."""
+    """Name of an effect in certificates."""
     return f"{effect.title} {effect.location} ({effect.name})"
 
 
@@ -240,5 +241,5 @@ def _switched_on(model: Model) -> Model:
 
 
 def in_comment(text: str) -> str:
-    """A text that may stand in a comment of XML, in which no two hyphens follow each other."""
+    """A text for a comment in XML, in which no two hyphens may follow each other."""
     return "\n" + text.replace("--", "- -").replace("--", "- -") + "\n"

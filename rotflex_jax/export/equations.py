@@ -39,8 +39,8 @@ _TOKEN = re.compile(
 def equation(effect: Effect | type[Effect]) -> str:
     r"""The equation of an effect in LaTeX, without dollar signs.
 
-    Position and speed of the effect's port are written as phi and its rate, the true value at a sensor
-    as y_0; parameters keep their names, in italics.
+    Position and speed of the effect's port are written as phi and its rate, and the true value at a sensor as
+    y_0. Parameters keep their names, in italics.
 
     >>> from rotflex_jax.effects import CubicSpring
     >>> print(equation(CubicSpring))
@@ -50,7 +50,7 @@ def equation(effect: Effect | type[Effect]) -> str:
 
 
 def to_latex(equation: str, parameters: Iterable[str]) -> str:
-    """LaTeX of a line of plain text whose `parameters` are names."""
+    """LaTeX of an equation in plain text, in which `parameters` are names."""
     names = set(parameters)
     out: list[tuple[str, str]] = []
     for match in _TOKEN.finditer(equation):
@@ -75,7 +75,7 @@ def to_latex(equation: str, parameters: Iterable[str]) -> str:
 
 
 def _name(word: str, parameters: set[str]) -> str | None:
-    """A name in mathematics, or None for a word."""
+    """LaTeX of a name in an equation, or None for an ordinary word."""
     if word in parameters:
         return rf"\mathit{{{word.replace('_', chr(92) + ' ')}}}"
     if word in _FUNCTIONS:
@@ -117,8 +117,8 @@ def text(model: Mechanism | Model) -> str:
 
         M q'' + D q' + K q = b v + sum over ports of p tau
 
-    with the matrices assembled from all linear effects, then the equation of every other effect at its port,
-    and the values of all parameters with their units.
+    The matrices are assembled from all linear effects. The equation of every other effect follows with its
+    port, then the values of all parameters with their units.
     """
     mechanism = _active(Model.of(model))
     lines = [f"q = ({', '.join(mechanism.coordinates)})", "M q'' + D q' + K q = b v + sum of p tau", ""]
@@ -145,7 +145,7 @@ def text(model: Mechanism | Model) -> str:
 def latex(model: Mechanism | Model) -> str:
     r"""The equations of motion in LaTeX: the matrices, one line per effect, and a table of parameters.
 
-    The text needs the package amsmath and can be included in a document unchanged.
+    The text needs the package amsmath. A document can include it unchanged.
     """
     mechanism = _active(Model.of(model))
     lines = [r"\[", r"M \ddot{q} + D \dot{q} + K q = b \, v + \sum_{p} p \, \tau_{p}, \qquad"]
@@ -189,7 +189,7 @@ def _matrices(mechanism: Mechanism) -> dict[str, np.ndarray]:
 
 
 def _with_equations(mechanism: Mechanism) -> Iterator[Effect]:
-    """Effects that are not in the matrices, in the order of the signal: voltage, ports, sensors."""
+    """Effects that are not in the matrices, in the order of the signal flow: voltage, ports, sensors."""
     path = ("input", "signal", "port", "channel")
     stage = lambda e: (path.index(e.acts_on), getattr(e, "stage", 0))  # noqa: E731
     for effect in sorted(mechanism.effects, key=stage):
@@ -237,7 +237,7 @@ _SPECIAL = {c: "\\" + c for c in "&%$#_{}"} | {
 
 
 def _words(name: str) -> str:
-    r"""Text in which no sign is a command of LaTeX: names may come from a file.
+    r"""A text with the special characters of LaTeX escaped; names may come from a file.
 
     >>> print(_words("100 %} \\input{x}"))
     100 \%\} \textbackslash{}input\{x\}
@@ -246,7 +246,7 @@ def _words(name: str) -> str:
 
 
 def _unit(unit: str) -> str:
-    """`N m s^2/rad` in upright letters."""
+    """LaTeX of a unit such as `N m s^2/rad`, in upright letters."""
     pieces = re.split(r"(\^\d| )", unit)
     body = "".join(
         r"\," if p == " " else f"^{{{p[1]}}}" if re.fullmatch(r"\^\d", p) else _words(p) for p in pieces

@@ -1,7 +1,7 @@
 """Scalar expressions: a computation in which all constants have been evaluated.
 
-Equal expressions are one object, so common subexpressions are shared; an operation on numbers is a number,
-and neutral elements are removed. `x 0` counts as zero, since effects are finite.
+Equal expressions are the same object, so common subexpressions are shared. An operation on numbers gives a
+number, and neutral elements are removed. A product with zero is zero, since effects are finite.
 """
 
 import weakref
@@ -18,7 +18,7 @@ class Operation(NamedTuple):
     """One operation on scalars.
 
     Attributes:
-        text: C code, with placeholders of its arguments.
+        text: C code, with placeholders for the arguments.
         value: The operation on numbers.
         truth: Whether the result is a truth value.
     """
@@ -87,12 +87,12 @@ OPERATIONS: dict[str, Operation] = {
 
 
 class Expression:
-    """An operation on scalars of which some are variables, or a variable.
+    """A variable, or an operation on scalars that contain variables.
 
     Attributes:
-        op: Of `OPERATIONS`, or the name of a variable that the printer knows.
+        op: Key of `OPERATIONS`, or name of a kind of variable that the C printer knows.
         args: Arguments.
-        truth: Whether it is a truth value.
+        truth: Whether the value is a truth value.
     """
 
     __slots__ = ("__weakref__", "args", "op", "truth")
@@ -120,7 +120,7 @@ _known: weakref.WeakValueDictionary[Any, Expression] = weakref.WeakValueDictiona
 
 
 def node(op: str, *args: Any, truth: bool = False) -> Expression:
-    """The one expression with this operation and these arguments."""
+    """The unique expression with this operation and these arguments, created if it does not exist."""
     key = (op, truth, *((type(a), a if isinstance(a, (Expression, str)) else repr(a)) for a in args))
     found = _known.get(key)
     if found is None:
@@ -182,7 +182,7 @@ def _either(a: Operand, b: Operand) -> Operand | None:
 def _chosen(c: Operand, a: Operand, b: Operand) -> Operand | None:
     if not isinstance(c, Expression):
         return a if c else b
-    # Not for -0.0 and 0.0, which are equal but not the same.
+    # Numbers are compared by their text, since -0.0 and 0.0 are equal but not the same.
     return a if a is b or (type(a) is type(b) is float and repr(a) == repr(b)) else None
 
 
@@ -211,7 +211,7 @@ def integer_power(x: Operand, n: int) -> Operand:
 
 
 def ordered(roots: list[Operand]) -> Iterator[Expression]:
-    """All expressions that the roots consist of, arguments before the expressions that use them."""
+    """All expressions from which the roots are built, arguments before the expressions that use them."""
     seen: set[Expression] = set()
     stack = [(r, False) for r in reversed(roots) if isinstance(r, Expression)]
     while stack:

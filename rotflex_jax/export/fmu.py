@@ -27,7 +27,7 @@ from rotflex_jax.models.model import Model
 from rotflex_jax.text.files import write_file
 from rotflex_jax.text.numbers import one_line
 
-# Bytes of the archive depend on nothing but the model.
+# Fixed date of all files in the archive, so that its bytes depend on the model only.
 _DATE = (1980, 1, 1, 0, 0, 0)
 
 _BASE_UNITS = {
@@ -49,22 +49,23 @@ def to_fmu(
 ) -> Exported:
     """A model as an FMU for co-simulation (FMI 3.0), with its certificate.
 
-    Inside are the C code of `to_c`, so that every effect is in it, and where a C compiler is found the
-    library for this machine. A step is a whole multiple of `Ts`; another one is refused with a message. The
-    input is held over the step. First positions and speeds are parameters that hold from the start on.
+    The archive contains the C code of `to_c`, with every effect, and a shared library for this machine if a C
+    compiler is found. A communication step must be a whole multiple of `Ts`; the FMU refuses any other step
+    with a message. The input is held over the step. Initial positions and speeds are fixed parameters.
 
     Args:
         model: Mechanism with its parameter values, or a Model.
-        Ts: Sampling period, the internal step [s].
-        name: Of the model.
+        Ts: Sampling period, which is the internal step [s].
+        name: Name of the model.
         u: Input of the certificate; None for three sines with rests.
 
     Returns:
-        The bytes of the archive with its certificate, which stands in `modelDescription.xml` as a comment.
-        Without a compiler or the package fmpy nothing is simulated, and the certificate says so.
+        The bytes of the archive, with the certificate, which `modelDescription.xml` contains as a comment.
+        Without a compiler or the package fmpy, nothing is simulated, and the certificate gives the reason.
 
     Raises:
-        InputError: An effect that C code cannot express; no name, no sampling period, no signal.
+        InputError: C code cannot express an effect; `name` is no name, `Ts` no sampling period, or `u` no
+            signal.
 
     Source: Modelica Association, Functional Mock-up Interface specification 3.0, 2022.
     """
@@ -90,7 +91,7 @@ def to_fmu(
 def run_in_fmpy(
     fmu: bytes, u: Real[np.ndarray, " N"] | Sequence[float], Ts: float
 ) -> Float[np.ndarray, "N C"]:
-    """What the outputs of an FMU of `to_fmu` are in co-simulation, from rest.
+    """Outputs of an FMU from `to_fmu` in co-simulation, from rest.
 
     Args:
         fmu: Bytes of the archive.
@@ -130,7 +131,7 @@ def run_in_fmpy(
 
 
 def platform_folder() -> str | None:
-    """Name that FMI has for this kind of machine, such as `x86_64-linux`; None where none is known."""
+    """Name of this platform in FMI, such as `x86_64-linux`; None if it is unknown."""
     systems = {"linux": "linux", "darwin": "darwin"}
     system = systems.get(sys.platform)
     machine = {"arm64": "aarch64", "amd64": "x86_64"}.get(
@@ -165,7 +166,7 @@ def _compiled(identifier: str, header: str, wrapper: str) -> bytes | None:
     if compiler is None or platform_folder() is None:
         return None
     with tempfile.TemporaryDirectory() as folder:
-        # Names without the folder: the library does not depend on where it was made.
+        # File names without the folder, so that the library does not depend on the place of compilation.
         write_file(Path(folder, "model.h"), header)
         write_file(Path(folder, "fmi3_model.c"), wrapper)
         command = [compiler, "-std=c99", "-shared", "-fPIC", "-O2", "-o", "model.so", "fmi3_model.c", "-lm"]
@@ -240,7 +241,7 @@ def _description(subject: Subject, name: str, identifier: str, token: str) -> ET
 
 
 def _free(name: str, taken: set[str]) -> str:
-    """A name that no variable has yet."""
+    """The name, with underscores appended until no other variable has it."""
     while name in taken:
         name += "_"
     taken.add(name)

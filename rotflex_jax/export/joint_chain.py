@@ -1,8 +1,8 @@
-"""A mechanism as a chain of joints about one axis: what simulators of rigid bodies can say of it.
+"""A mechanism as a chain of joints about one axis, as far as simulators of rigid bodies can represent it.
 
-The coordinates are the angles (or ways) of joints one behind the other, so that the first k bodies move with
-the sum of the first coordinates. A port whose vector is one at the first coordinates and zero after them is a
-body; one with a single one is a joint; any other is a combination of joints.
+The coordinates are the angles (or displacements) of successive joints, so that body k moves with the sum of
+the first k coordinates. A port whose vector is one at the first coordinates and zero after them is a body. A
+port whose vector has a single one is a joint. Any other port is a combination of joints.
 """
 
 import dataclasses
@@ -18,21 +18,21 @@ from rotflex_jax.mechanism import Mechanism
 Vector = tuple[float, ...]
 
 LEAST_INERTIA = 1e-7
-"""Inertia of a body that has none of its own, as a share of the smallest one: simulators refuse zero."""
+"""Inertia given to a body without one, as a share of the smallest inertia: simulators refuse zero."""
 
-# A speed at which friction that falls with it has fallen [rad/s].
+# Speed at which friction that decreases with speed has reached its final level [rad/s].
 _FAST = 1e6
 
 
 @dataclasses.dataclass
 class Place:
-    """What acts at one port, or at several of one vector.
+    """Sum of the effects at one port, or at several ports with the same vector.
 
     Attributes:
-        name: Of the port.
-        inertia: [kg m^2].
-        stiffness: [N m/rad].
-        damping: [N m s/rad].
+        name: Name of the port.
+        inertia: Inertia [kg m^2].
+        stiffness: Stiffness [N m/rad].
+        damping: Viscous damping [N m s/rad].
         friction: Level of dry friction [N m].
         gravity: Amplitudes of sine and cosine of the weight [N m].
         torque: Constant torque [N m].
@@ -52,15 +52,15 @@ class Drive:
     """A motor: torque = min(max(gain v + constant + at_position position + at_speed speed, -limit), limit).
 
     Attributes:
-        name: Of the port and the effect.
-        vector: Of its port.
+        name: Name of the port and of the effect.
+        vector: Vector of the port.
         gain: Torque per input.
         constant: Constant torque.
         at_position: Torque per position.
         at_speed: Torque per speed.
         limit: Largest torque.
-        coil: Torque per current, voltage per speed of the port, resistance and inductance, where the
-            current has a time constant.
+        coil: Torque per current, voltage per speed of the port, resistance and inductance; None for a current
+            without a time constant.
     """
 
     name: str
@@ -75,16 +75,16 @@ class Drive:
 
 @dataclasses.dataclass
 class Chain:
-    """A mechanism in these words.
+    """A mechanism as a chain of joints.
 
     Attributes:
-        places: By vector of the port.
-        drives: Motors; all have the one input.
+        places: Vector of a port -> effects there.
+        drives: Motors, which all have the same input.
         input_limit: Largest input.
         lag: Time constant between command and input [s]; 0 for none.
-        offset: What is added to the input.
-        left_out: Effects that are not in it, with the reason.
-        approximated: Effects that are in it otherwise.
+        offset: Offset that is added to the input.
+        left_out: Effects that the chain lacks, with the reason.
+        approximated: Effects that the chain represents in a different way.
     """
 
     places: dict[Vector, Place] = dataclasses.field(default_factory=dict)
@@ -97,10 +97,10 @@ class Chain:
 
     @classmethod
     def of(cls, mechanism: Mechanism, form: str) -> "Chain":
-        """The mechanism as a chain.
+        """The mechanism as a chain of joints, for an export to the format `form`.
 
         Raises:
-            InputError: It neither turns nor slides.
+            InputError: The mechanism neither turns nor slides.
         """
         if mechanism.units.motion not in ("rad", "m"):
             raise InputError(
@@ -112,7 +112,7 @@ class Chain:
             chain._add(mechanism, effect)
         for drive in chain.drives:
             drive.constant += drive.gain * chain.offset
-        # Friction of two levels is friction of their mean and a constant torque, which a motor can give.
+        # Friction with two levels equals friction with their mean and a constant torque, which a motor gives.
         for vector, place in chain.places.items():
             able = (d for d in chain.drives if d.vector == vector and d.coil is None and math.isinf(d.limit))
             drive = next(able, None)
@@ -172,7 +172,7 @@ class Chain:
         place.damping += float(stamp.damping)
 
     def _add_servo(self, effect: PositionLoop, vector: Vector, place: Place) -> None:
-        """The limit of the duty holds without the back-EMF, which therefore is damping of the joint."""
+        """Adds a servo; its duty limit does not include the back-EMF, which becomes damping of the joint."""
         on = 1.0 if effect.enabled is None else effect.enabled
         per_duty = on * effect.torque_constant * effect.supply / effect.resistance
         stiffness = per_duty * effect.gain * effect.gain_scale
@@ -216,13 +216,13 @@ def _has_coil(mechanism: Mechanism) -> bool:
 
 
 def joint_of(vector: Vector) -> int | None:
-    """Which joint a port is, or None for a combination of joints."""
+    """Index of the joint that a port is; None for any other port."""
     ones = [k for k, x in enumerate(vector) if x]
     return ones[0] if len(ones) == 1 and vector[ones[0]] == 1.0 else None
 
 
 def body_of(vector: Vector) -> int | None:
-    """Which body a port is, or None for none."""
+    """Index of the body that a port is; None for any other port."""
     moved = sum(1 for x in vector if x)
     return moved - 1 if moved and vector == (1.0,) * moved + (0.0,) * (len(vector) - moved) else None
 
@@ -230,23 +230,23 @@ def body_of(vector: Vector) -> int | None:
 def mass_and_lever(
     inertia: float, amplitudes: tuple[float, float], free_fall: float
 ) -> tuple[float, float, float]:
-    """Mass and its place on a body (x, z) that has this inertia about the axis and this weight.
+    """Mass and position (x, z) of the centre of mass of a body with a given inertia and weight.
 
-    The axis is y, weight pulls along -z. Half of the inertia is that of the mass on its lever.
+    The axis is y, and the weight acts along -z. The mass at its lever contributes half of the inertia.
 
     Args:
-        inertia: Of the body about the axis [kg m^2].
-        amplitudes: Of sine and cosine [N m].
-        free_fall: [m/s^2].
+        inertia: Inertia of the body about the axis [kg m^2].
+        amplitudes: Amplitudes of sine and cosine of the weight [N m].
+        free_fall: Acceleration of free fall [m/s^2].
     """
     sine, cosine = amplitudes
     weight = math.hypot(sine, cosine)
     if not weight:
-        return inertia, 0.0, 0.0  # any mass on the axis: the number of the inertia
+        return inertia, 0.0, 0.0  # without a weight, any mass on the axis will do
     mass = 2 * weight**2 / (inertia * free_fall**2)
     return mass, -cosine / (mass * free_fall), -sine / (mass * free_fall)
 
 
 def described(value: Any) -> str:
-    """A number in an XML attribute, to the last digit."""
+    """A number for an XML attribute, with all its digits."""
     return repr(float(value))

@@ -1,4 +1,4 @@
-"""A model for MuJoCo (MJCF): bodies, joints, tendons for other ports, actuators, sensors."""
+"""Export of a model to MuJoCo (MJCF): bodies, joints, tendons for other ports, actuators, sensors."""
 
 import math
 import re
@@ -29,9 +29,9 @@ from rotflex_jax.models.model import Model
 from rotflex_jax.text.numbers import one_line
 
 LONGEST_STEP = 1e-4
-"""Step of the simulator that a file asks for [s], at most: larger ones are less accurate in dry friction."""
+"""Largest time step in a file [s]: larger steps are less accurate with dry friction."""
 
-# Dry friction is a soft constraint in MuJoCo: as hard as its solver bears.
+# Parameters of dry friction, a soft constraint in MuJoCo: the hardest ones that its solver tolerates.
 _HARD = "0.9999 0.9999 0.001"
 
 
@@ -45,24 +45,26 @@ def to_mjcf(
 
         joints: damping, frictionloss, stiffness, armature;  motor: torque = gain u + bias_speed speed
 
-    Each coordinate is a joint, one behind the other about one axis, with a body. The inertia that the motor
-    turns stands as `armature` of its joint; other ports (the arm against the ground) are fixed tendons. A
-    motor is a `general` actuator with its back-EMF, with an inductance a `dcmotor`; a servo is a `general`
-    actuator that is limited in force, its input the goal. What MuJoCo cannot say is left out, or stands as
-    Coulomb friction of the level at speed, and the certificate names it.
+    Each coordinate becomes a joint with a body, and the joints form a chain about one axis. The inertia that
+    a motor turns becomes `armature` of its joint. Ports that are combinations of joints (the arm against the
+    ground) become fixed tendons. A motor becomes a `general` actuator with its back-EMF, or a `dcmotor` if it
+    has an inductance. A servo becomes a `general` actuator with a limited force, whose input is the goal.
+    Effects that MuJoCo cannot represent are left out, or approximated by Coulomb friction of a constant
+    level; the certificate lists them.
 
     Args:
         model: Mechanism with its parameter values, or a Model; its joints turn or slide.
-        Ts: Sampling period of the certificate's input [s]; the step of the file is a part of it.
-        name: Of the machine.
+        Ts: Sampling period of the certificate's input [s]; it is a multiple of the time step in the file.
+        name: Name of the machine.
         u: Input of the certificate; None for three sines with rests.
 
     Returns:
-        The text of the file with its certificate, which stands in it as a comment. Without the package
-        mujoco nothing is simulated, and the certificate says so.
+        The text of the file, with the certificate, which the file contains as a comment. Without the package
+        mujoco nothing is simulated, and the certificate gives the reason.
 
     Raises:
-        InputError: A machine that neither turns nor slides; no name, no sampling period, no signal.
+        InputError: The machine neither turns nor slides; `name` is no name, `Ts` no sampling period, or `u`
+            no signal.
 
     Source: MuJoCo documentation, XML reference; E. Todorov, Convex and analytically-invertible dynamics with
     contacts and constraints, 2014, for friction as a constraint.
@@ -77,7 +79,7 @@ def to_mjcf(
         y = run_in_mujoco(text, subject.u, subject.Ts)
     except InputError as missing:
         why_not = str(missing)
-    except ValueError as error:  # an earlier MuJoCo lacks elements of a later one
+    except ValueError as error:  # an earlier version of MuJoCo lacks some elements
         why_not = f"{by} does not read the file: {one_line(str(error))[:200]}"
     certificate = subject.certificate("MJCF", by, y, chain.left_out, chain.approximated, why_not)
     tree.insert(0, ET.Comment(in_comment(str(certificate))))
@@ -87,11 +89,11 @@ def to_mjcf(
 def run_in_mujoco(
     text: str, u: Real[np.ndarray, " N"] | Sequence[float], Ts: float
 ) -> Float[np.ndarray, "N C"]:
-    """What the sensors of an MJCF file read in MuJoCo, from rest.
+    """Readings of the sensors of an MJCF file, simulated in MuJoCo from rest.
 
     Args:
-        text: Of the file.
-        u: Input, held over each sample, of every actuator.
+        text: Text of the file.
+        u: Input of every actuator, held over each sample.
         Ts: Sampling period [s], a multiple of the file's time step.
 
     Raises:
@@ -102,22 +104,22 @@ def run_in_mujoco(
     d = mujoco.MjData(m)
     steps = max(round(Ts / m.opt.timestep), 1)
     y = np.zeros((len(u), m.nsensordata))
-    # A lag counts its command as having been there before.
+    # A lag starts in its steady state for the first command.
     d.act[:] = u[0] if m.na and m.actuator_dyntype[0] == mujoco.mjtDyn.mjDYN_FILTEREXACT else 0.0
     for k, value in enumerate(u):
         d.ctrl[:] = value
         mujoco.mj_step(m, d)
-        y[k] = d.sensordata  # read at the start of that step
+        y[k] = d.sensordata  # MuJoCo evaluates sensors at the start of the step
         for _ in range(steps - 1):
             mujoco.mj_step(m, d)
     return y
 
 
 def machine_name(name: Any) -> str:
-    """A name for a machine.
+    """The name of a machine on one line, checked.
 
     Raises:
-        InputError: It is no text, or an empty one.
+        InputError: The name is no text, or an empty one.
     """
     if isinstance(name, str) and name.strip():
         return one_line(name)
@@ -178,17 +180,17 @@ def _mujoco(mechanism: Mechanism, chain: Chain, name: str, Ts: float) -> ET.Elem
 def shares(
     mechanism: Mechanism, chain: Chain, armature: bool
 ) -> tuple[dict[int, Place], list[tuple[float, tuple[float, float]]]]:
-    """What stands at the joints, by number, and inertia and weight of each body.
+    """Index of a joint -> effects at the joint, and (inertia, weight) of each body.
 
-    An inertia that a motor turns belongs to its joint (armature), unless it has a weight; so does one at a
-    port that is a joint and no body. A weight needs a body with an inertia: where there is none it is moved
-    to what is left out.
+    An inertia that a motor turns belongs to its joint (armature) unless it has a weight. An inertia at a port
+    that is a joint and no body belongs to the joint too. A weight needs a body with an inertia; a weight
+    without one is removed from the chain and added to its `left_out`.
 
     Args:
         mechanism: The machine.
-        chain: The same as a chain.
-        armature: Whether a joint of the form has an inertia of its own that a motor turns. MuJoCo makes the
-            friction of a sliding joint too soft where its body weighs next to nothing.
+        chain: The machine as a chain of joints.
+        armature: Whether a joint may have the inertia that a motor turns. In MuJoCo a sliding joint should
+            not: its friction becomes too soft if the body has almost no mass.
     """
     driven = {d.vector for d in chain.drives}
     joints: dict[int, Place] = {}
@@ -217,7 +219,7 @@ def _tendons(
     places: dict[Vector, Place],
     hard: dict[str, str],
 ) -> dict[Vector, str]:
-    """Fixed tendons for ports that are combinations of joints; their names, by vector."""
+    """Adds fixed tendons for ports that are combinations of joints; returns vector -> name of its tendon."""
     measured = {tuple(map(float, mechanism.port_vectors[port])) for _, (port, _) in mechanism.outputs}
     needed = [d.vector for d in chain.drives] + sorted(measured)
     names: dict[Vector, str] = {}
@@ -253,13 +255,15 @@ def _actuator(
     limit = chain.input_limit
     clip = {"ctrlrange": f"{number(-limit)} {number(limit)}"} if math.isfinite(limit) else {}
     if drive.coil is not None and drive.coil[1] > 0 and drive.coil[0] > 0:
-        # MuJoCo has one motor constant: the electric side is scaled so that it is the EMF's.
+        # MuJoCo has one motor constant: it is the back-EMF constant here, and resistance and inductance are
+        # scaled to keep the torque.
         gain, emf, resistance, inductance = drive.coil
         electric = {"resistance": resistance * emf / gain, "inductance": inductance * emf / gain}
         motor = {k: number(v) for k, v in electric.items()}
         _element(parent, "dcmotor", name=drive.name, **on, motorconst=number(emf), **motor, **clip)
         return
-    # At just the opposite of the gain MuJoCo would read a positive last number as a damping ratio.
+    # With exactly the negative gain at the position, MuJoCo would read a positive third number as a damping
+    # ratio.
     bias = [drive.constant, drive.at_position * (1 + 1e-12), drive.at_speed]
     law = {"gaintype": "fixed", "gainprm": number(drive.gain)}
     if any(bias):
@@ -273,7 +277,7 @@ def _actuator(
 
 
 def safe_identifier(name: str) -> str:
-    """A name of letters, digits and underscores for programs that allow no other.
+    """A name with letters, digits and underscores only, for programs that allow no other characters.
 
     >>> safe_identifier("2 fast; int")
     '_2_fast__int'

@@ -1,8 +1,8 @@
 """A model's step as scalar expressions, and its actuation as a recursion from sample to sample.
 
 An actuation effect maps the sequence `u` (N,) to the sequence `v` (N,). Its jaxpr is evaluated on a symbolic
-sequence, of which only the indices are known: entry k of a delayed sequence is entry max(k - d, 0) of the
-original, a scan is a state, entry 0 is the first command. The result is a recursion over the samples.
+sequence, of which only the indices are known. Entry k of a delayed sequence is entry max(k - d, 0) of the
+original, entry 0 is the first command, and a scan becomes a state. The result is a recursion over samples.
 """
 
 import dataclasses
@@ -24,16 +24,16 @@ from rotflex_jax.models.model import Model
 from rotflex_jax.runtime.xla import double_precision
 
 SEQUENCE_LENGTH = 16384
-"""Samples of the symbolic sequence: more than any delay."""
+"""Length of the symbolic sequence [samples], which must exceed any delay."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Stream:
-    """A symbolic sequence, or entries of it.
+    """A symbolic sequence, or some entries of it.
 
     Attributes:
-        base: Expression of the present sample.
-        index: Which samples, in any shape; -1 for `before`.
+        base: Expression of the sequence at the present sample.
+        index: Indices of the samples, in any shape; -1 for `before`.
         before: Value before the first sample.
     """
 
@@ -46,13 +46,13 @@ class Stream:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Of the entries."""
+        """Shape of the entries."""
         return self.index.shape
 
 
 @dataclasses.dataclass
 class SequenceState:
-    """A state of the actuation: its value before the first sample, and the one after a sample."""
+    """A state of the actuation: its value before the first sample, and its value after a sample."""
 
     start: Operand
     next: Operand = 0.0
@@ -65,7 +65,7 @@ class SequenceRules:
         self.states: list[SequenceState] = []
 
     def __call__(self, eqn: Any, given: list[Any]) -> list[Any] | None:
-        """Results of an equation, or None where it has no symbolic sequence."""
+        """Results of an equation, or None if this class does not apply to it."""
         if not any(isinstance(g, Stream) for g in given):
             return None
         name, params = eqn.primitive.name, eqn.params
@@ -74,7 +74,7 @@ class SequenceRules:
         if name in MOVES:
             return self._move(eqn, given)
         if name in CALLS:
-            return None  # its own equations are passed here one by one
+            return None  # the equations inside are passed to this method one by one
         present = [self._present(g) for g in given]
         inner = _without_streams(eqn, present)
         shape = next(g.shape for g in given if isinstance(g, Stream))
@@ -152,7 +152,11 @@ class SequenceRules:
 
 
 def _ramp(value: np.ndarray) -> Operand:
-    """A number that grows linearly with the sample."""
+    """Expression of numbers that grow linearly with the sample.
+
+    Raises:
+        CannotUnfold: The numbers vary in another way.
+    """
     numbers = np.zeros(0) if unknown(value) else value.astype(float).ravel()
     if len(numbers) == SEQUENCE_LENGTH:
         step = (numbers[-1] - numbers[0]) / (SEQUENCE_LENGTH - 1)
@@ -193,7 +197,7 @@ def _only(value: Any) -> Operand:
 
 
 def per_sample(function: Callable[[Any], Any], u: Operand) -> tuple[Operand, Sequence[SequenceState]]:
-    """A function of sequences (N,) as an expression of the present sample `u`, and the states it needs.
+    """A function of sequences (N,) as an expression of the present sample `u`, and the states that it needs.
 
     Raises:
         CannotUnfold: The function uses later samples, or depends on time.
@@ -211,10 +215,10 @@ class SampleProgram:
     """A model as scalar expressions.
 
     Attributes:
-        outputs: Readings at the start of a sample, from the state.
-        voltage: Voltage at the motor, from the command `u`.
+        outputs: Readings at the start of a sample, as functions of the state.
+        voltage: Voltage at the motor, as a function of the command `u`.
         sequence_states: States of the actuation.
-        state: State after a step, from the state and the voltage `v`.
+        state: State after a step, as a function of the state and the voltage `v`.
     """
 
     outputs: list[Operand]
@@ -227,7 +231,8 @@ def sample_program(model: Model, Ts: float) -> SampleProgram:
     """The step of a model as scalar expressions.
 
     Raises:
-        InputError: An effect that C code cannot express, by name, or a voltage that is not held.
+        InputError: C code cannot express an effect, which the message names, or the voltage is not held
+            between samples.
     """
     if (between := getattr(model.solver, "between", "held")) != "held":
         raise InputError(
@@ -251,7 +256,7 @@ def _program(model: Model, Ts: float) -> SampleProgram:
     v = np.array(node("v"), object)
     with double_precision():
         values, gates = model.parameters_and_gates()
-        one_step: Any = dataclasses.replace(solver, substeps=1)  # of which the code takes `substeps`
+        one_step: Any = dataclasses.replace(solver, substeps=1)  # the C code repeats it `substeps` times
         constants = solver.prepare(structure, values, gates, jnp.asarray(Ts))
         outputs = unfold(lambda s: read_outputs(mechanism, gates, s), x)
         with without_shortcuts():
@@ -263,7 +268,7 @@ def _program(model: Model, Ts: float) -> SampleProgram:
 
 
 def _obstacle(model: Model, Ts: float) -> str:
-    """The effect that cannot be unfolded."""
+    """Name of the effect that cannot be written as scalar expressions."""
     gates = model.gates or (1.0,) * len(model.mechanism.effects)
     linear = [(e, g) for e, g in zip(model.mechanism.effects, gates, strict=True) if e.is_linear]
     for effect, gate in zip(model.mechanism.effects, gates, strict=True):

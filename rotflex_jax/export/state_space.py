@@ -1,4 +1,4 @@
-"""A model as state space about an operating point, for control design."""
+"""A model in state space, linearised about an operating point, for control design."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -28,11 +28,11 @@ class LinearModel:
         A: State matrix.
         B: Input matrix.
         C: Output matrix.
-        D: Feedthrough; zero, since a voltage acts on speeds first.
+        D: Feedthrough matrix; zero, since the outputs depend on the states only.
         Ts: Sampling period [s]; None for continuous time.
-        states: Names.
-        inputs: Names; the voltage, then the signals that drive the model beside it.
-        outputs: Names.
+        states: Names of the states.
+        inputs: Names of the inputs: the voltage, then the signals of the recordings that act on the model.
+        outputs: Names of the outputs.
         dropped: Effects that the linear model does not contain, one sentence each.
     """
 
@@ -47,7 +47,14 @@ class LinearModel:
     dropped: tuple[str, ...]
 
     def discretise(self, Ts: float) -> "LinearModel":
-        """The same model from sample to sample, exact for an input held between samples."""
+        """The model in discrete time, exact for an input that is held between samples.
+
+        Args:
+            Ts: Sampling period [s].
+
+        Raises:
+            InputError: The model is in discrete time already, or `Ts` is not positive and finite.
+        """
         if self.Ts is not None:
             raise InputError("The model is in discrete time already; discretise the continuous one.")
         if not (np.isfinite(Ts) and Ts > 0):
@@ -56,7 +63,7 @@ class LinearModel:
         return dataclasses.replace(self, A=A, B=B, Ts=float(Ts))
 
     def to_control(self) -> Any:
-        """A `StateSpace` of the package python-control, with names.
+        """The model as `StateSpace` of the package python-control, with names of its signals.
 
         Raises:
             InputError: The package is not installed.
@@ -86,16 +93,17 @@ def state_space(
 ) -> LinearModel:
     """The model linearised about an operating point.
 
-    Linear effects enter exactly, torques, memories and sensors by their slope. Memories are at their steady
-    value at the operating point, where they have one. Effects without a slope are left out and named: dry
-    friction, actuation, the play of a gear. Not where friction dominates the motion: simulate that.
+    Linear effects enter exactly. Nonlinear torques, memories and sensors enter with their slope at the
+    operating point, where memories have their steady values if these exist. Effects without a slope are left
+    out and listed in `dropped`: dry friction, actuation, the play of a gear. Not for a motion that is
+    dominated by friction: simulate it instead.
 
     Args:
         model: Mechanism with its parameter values, or a Model.
-        Ts: Sampling period [s] of a discrete model; None for continuous time.
-        positions: Of the coordinates; zero if None.
-        speeds: Of the coordinates; zero if None.
-        voltage: At the motor [V].
+        Ts: Sampling period [s] of a model in discrete time; None for continuous time.
+        positions: Positions of the coordinates; zero if None.
+        speeds: Speeds of the coordinates; zero if None.
+        voltage: Voltage at the motor [V].
 
     Returns:
         LinearModel.
@@ -130,7 +138,7 @@ def state_space(
         A, B = (np.asarray(m) for m in jax.jacfwd(slope, argnums=(0, 1))(x, u))
         C = np.asarray(jax.jacfwd(lambda s: read_outputs(mechanism, gates, s))(x))
     names = state_names(mechanism)
-    # The gear has no play here, so its rotor has no states of its own.
+    # The linear model neglects the play of a gear, so the rotor has no states of its own.
     rows = [i for i in range(layout.size) if not layout.rotor <= i < start]
     linear = LinearModel(
         A=A[np.ix_(rows, rows)],
@@ -151,7 +159,7 @@ def _point(given: Sequence[float] | None, n: int, what: str) -> np.ndarray:
 
 
 def _steady_memories(slope: Any, x: Array, u: Array, start: int) -> Array:
-    """The state with its memories, currents included, at their steady values where they have one."""
+    """The state with its memories, including currents, at their steady values if these exist."""
     for k in range(start, len(x)):
         for _ in range(20):
             rate, gain = slope(x, u)[k], jax.jacfwd(lambda s: slope(s, u))(x)[k, k]

@@ -1,7 +1,7 @@
-"""From a traced function to scalar expressions, so that an effect is written once, in Python.
+"""Conversion of a traced function to scalar expressions, so that an effect is written once, in Python.
 
-The jaxpr of a function is evaluated with expressions as inputs. Equations of constants alone are computed;
-equations that only rearrange entries are evaluated on the indices of the entries.
+The jaxpr of a function is evaluated with expressions as inputs. Equations of constants alone are computed.
+Equations that only rearrange entries are evaluated on the indices of the entries.
 """
 
 from collections.abc import Callable, Sequence
@@ -36,7 +36,7 @@ MOVES = {
     "transpose",
     "unstack",
 }
-# How many operands hold entries; the others are indices.
+# Number of operands that contain entries; the other operands are indices.
 _MOVED = {"dynamic_slice": 1, "dynamic_update_slice": 2, "gather": 1}
 
 
@@ -224,7 +224,7 @@ def unfold(function: Callable[..., Any], *inputs: Shaped[np.ndarray, "..."]) -> 
         Array of numbers or expressions.
 
     Raises:
-        CannotUnfold: The number of its iterations depends on the input, or it uses an unsupported operation.
+        CannotUnfold: The number of iterations depends on the input, or an operation is not supported.
     """
     like = [jax.ShapeDtypeStruct(np.shape(i), np.float64) for i in inputs]
     closed = jax.make_jaxpr(function)(*like)
@@ -235,10 +235,11 @@ def run(jaxpr: Jaxpr, consts: Sequence[Any], inputs: Sequence[Any], rules: Any =
     """The results of a jaxpr for its constants and inputs.
 
     Args:
-        jaxpr: What to evaluate.
-        consts: Its constants.
-        inputs: Its inputs.
-        rules: Applied first to every equation, `rules(eqn, values)`: results, or None where not applicable.
+        jaxpr: The jaxpr.
+        consts: Constants of the jaxpr.
+        inputs: Inputs of the jaxpr.
+        rules: Function that is tried first on every equation, `rules(eqn, values)`; it returns results, or
+            None if it does not apply.
     """
     values: dict[Any, Any] = {}
     read = lambda a: np.asarray(a.val) if isinstance(a, Literal) else values[a]  # noqa: E731

@@ -1,4 +1,4 @@
-"""A model as URDF: links, joints with damping and friction; what a URDF cannot say is listed."""
+"""Export of a model to URDF: links, joints with damping and friction, and a list of what URDF lacks."""
 
 import math
 import xml.etree.ElementTree as ET
@@ -35,22 +35,25 @@ def to_urdf(
 
         links: inertia about the axis, weight as a mass off the axis;  joints: damping and friction
 
-    Each coordinate is a joint, one behind the other about one axis, with a link. A URDF has neither motors
-    nor springs: the equation of each motor is given, for whoever applies its torque as effort of the joint;
-    springs are left out. Not for a flexible joint, then, unless the simulator adds its spring: `to_mjcf`.
+    Each coordinate becomes a joint with a link, and the joints form a chain about one axis. A URDF has
+    neither motors nor springs. The certificate gives the equation of each motor, so that a user can apply its
+    torque as effort of the joint; springs are left out. Not for a flexible joint, therefore, unless the
+    simulator adds the spring: use `to_mjcf`.
 
     Args:
         model: Mechanism with its parameter values, or a Model; its joints turn or slide.
         Ts: Sampling period of the certificate's input [s].
-        name: Of the machine.
+        name: Name of the machine.
         u: Input of the certificate; None for three sines with rests.
 
     Returns:
-        The text of the file with its certificate, which stands in it as a comment: MuJoCo reads the file, and
-        the torques of the motors are applied to its joints. Without the package mujoco nothing is simulated.
+        The text of the file, with the certificate, which the file contains as a comment. For the certificate
+        MuJoCo simulates the file, with the torques of the motors applied to the joints. Without the package
+        mujoco nothing is simulated.
 
     Raises:
-        InputError: A machine that neither turns nor slides; no name, no sampling period, no signal.
+        InputError: The machine neither turns nor slides; `name` is no name, `Ts` no sampling period, or `u`
+            no signal.
 
     Source: ROS, URDF XML specification, link and joint.
     """
@@ -98,7 +101,7 @@ def _robot(mechanism: Mechanism, chain: Chain, name: str) -> ET.Element:
         ET.SubElement(joint, "parent", {"link": parent})
         ET.SubElement(joint, "child", {"link": f"{coordinate} link"})
         ET.SubElement(joint, "axis", {"xyz": "0 1 0" if turns else "1 0 0"})
-        if not turns:  # the format wants limits there; these are none
+        if not turns:  # URDF requires limits of a sliding joint; these are never reached
             limits = {"lower": "-1e6", "upper": "1e6", "effort": "1e9", "velocity": "1e6"}
             ET.SubElement(joint, "limit", limits)
         if k in joints and (joints[k].damping or joints[k].friction):
@@ -143,7 +146,7 @@ def _tell_what_is_left_out(mechanism: Mechanism, chain: Chain) -> None:
 
 
 def _run(text: str, subject: Subject, chain: Chain) -> Float[np.ndarray, "N C"]:
-    """The file in MuJoCo, with the torques that the motors would give."""
+    """Outputs of the file in MuJoCo, with the torques of the motors applied to the joints."""
     mujoco = optional("mujoco", "A certificate of URDF")
     m = mujoco.MjModel.from_xml_string(text)
     steps = max(10, int(np.ceil(subject.Ts / LONGEST_STEP - 1e-9)))

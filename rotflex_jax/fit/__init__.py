@@ -1,6 +1,6 @@
-"""Fits: parameters of a mechanism, or weights of a basis, from recordings, with honest intervals.
+"""Fits: parameters of a mechanism, or weights of a basis, from recordings, with robust intervals.
 
-The two know nothing of each other, and a name is loaded when it is first asked for.
+The two kinds of fits are independent of each other. A name is loaded when it is first used.
 """
 
 import lazy_loader

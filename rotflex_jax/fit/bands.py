@@ -2,9 +2,10 @@
 
     y - y_hat ~ N(0, sum of parts),   part_p = S V S',  S = J_p + J_x dx0/dp
 
-The parts are first-order propagations of what is uncertain: parameters with the covariance of the fit, the
-first state with the noise of the samples that it is estimated on, what each recording has for itself,
-process torques, the sensor, and what the model lacks, as large as free runs over known recordings show it.
+Each part is the variance caused by one source of uncertainty, to first order: the parameters (by the
+covariance of the fit), the first state (by the noise of the samples from which it is estimated), local
+parameters of each recording, process noise, the sensor, and what the model lacks (by the errors of free runs
+over known recordings).
 """
 
 import dataclasses
@@ -43,34 +44,36 @@ PARTS = (
     "what the model lacks",
     "between models",
 )
-"""What widens a band, in the order of tables."""
-# A recording starts at rest where its first speeds are below this share of the speeds that follow.
+"""Sources of uncertainty that widen a band, in the order of tables."""
+# A recording starts at rest if its first speeds are below this share of the root mean square speeds.
 AT_REST = 0.02
-# Steps of the search for a first state, halvings of one, and the gain below which it ends [squared error
-# in units of the noise].
+# Largest number of steps of the fit of a first state, of halvings of a step, and least gain of a step
+# [squared error in units of the noise].
 FIRST_STATE_STEPS, HALVED_STEPS, ENOUGH_GAIN = 12, 4, 0.1
-# Standard deviation, in ranges of the measured motion, from which on propagation to first order says nothing.
+# Standard deviation, in ranges of the measured motion, from which on propagation to first order is
+# meaningless.
 MOST_RANGES = 100
-# Phase per sample from which on a step no longer resolves the swing of bristles; speed [rad/s] and state at
-# which their stiffness at rest is taken.
+# Phase per sample from which on a step no longer resolves the oscillation of bristles [rad]; speed [rad/s]
+# and state at which their stiffness at rest is computed.
 MOST_BRISTLE_PHASE, SLOW_SPEED, SMALL_STATE = 0.5, 1e-6, 1e-6
-# Halvings of an interval that holds a quantile of a mixture.
+# Number of bisections of the interval that contains a quantile of a mixture.
 HALVINGS = 60
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Bands:
-    """Where a recording's outputs would lie, sample by sample.
+    """Bands in which the outputs of a recording would lie, sample by sample.
 
     Attributes:
-        recording: Whose input was run.
-        channels: Of the model.
-        units: Of these.
+        recording: Recording whose input was run.
+        channels: Channels of the model.
+        units: Units of the channels.
         level: Probability of each sample to lie inside.
-        middle: Free run, memories of its start from the first samples; of several models the weighted mean.
-        lower: Lower end.
-        upper: Upper end.
-        parts: What widens the band -> standard deviation by this alone.
+        middle: Free run, with first states (memories included) from the first samples; for several models,
+            the weighted mean of their free runs.
+        lower: Lower end of the band.
+        upper: Upper end of the band.
+        parts: Source of uncertainty -> standard deviation that it causes alone.
     """
 
     recording: Recording
@@ -83,13 +86,13 @@ class Bands:
     parts: dict[str, Float[np.ndarray, "N C"]]
 
     def coverage(self, recording: Recording | None = None) -> dict[str, float]:
-        """Share of the measured samples inside the band, per channel, those at the start not counted.
+        """Share of the measured samples inside the band, by channel, without the first `n_init` samples.
 
         Args:
-            recording: What was measured; the recording of the band if None.
+            recording: Measurement under the same input; the recording of the band if None.
 
         Raises:
-            InputError: A recording of another length, or without a channel.
+            InputError: If the recording has another length, or lacks a channel.
         """
         recording = single(self.recording if recording is None else recording, "recording")
         missing = [c for c in self.channels if c not in recording.channels]
@@ -105,7 +108,7 @@ class Bands:
 
     @property
     def shares(self) -> dict[str, dict[str, float]]:
-        """Channel -> what widens its band -> share of the mean variance."""
+        """Channel -> source of uncertainty -> share of the mean variance."""
         mean = {name: np.mean(np.square(part), axis=0) for name, part in self.parts.items()}
         total = np.sum(list(mean.values()), axis=0)
         return {
@@ -127,13 +130,13 @@ class Bands:
         }
 
     def plot(self) -> "Figure":
-        """The band around the free run with what was measured, and its parts over time."""
+        """Figure of the band around the free run with the measured outputs, and of its parts over time."""
         from rotflex_jax.fit.bands_figure import bands_figure  # takes long to import
 
         return bands_figure(self)
 
     def _repr_html_(self) -> str:
-        """Mean width, coverage and what widens the band, per channel."""
+        """A card with mean width, coverage and largest source of uncertainty of each channel."""
         rows, covered, shares = [], self.coverage(), self.shares
         for c, (channel, unit) in enumerate(zip(self.channels, self.units, strict=True)):
             half, read = readable(float(np.mean(self.upper[:, c] - self.lower[:, c]) / 2), unit)
@@ -169,30 +172,36 @@ def prediction_bands(
 
         y_k - y_hat_k ~ N(0, v_k),   v_k = sum of the parts,   band: y_hat_k -+ quantile(level) sqrt(v_k)
 
-    The run starts from the first `n_init` samples, like every free run; memories that no sensor shows, such
-    as that of a friction, are estimated from them too where the recording does not start at rest. The
-    variance of a sample adds up parameters (by the covariance of the fit, with the first state that follows
-    them), the first state (by the noise of the samples that it is estimated on), parameters that each
-    recording has for itself (by their scatter), process torques (by the linear part of the machine), the
-    noise of the sensors, and what the model lacks. That is a constant for each channel, so large that bands
-    over `known` recordings hold the share `level` of their samples; without any as large as the residuals of
-    the fit beyond the sensor's noise, and nothing where these are of predictions, which do not show what a
-    free run misses. Of several models with weights the band is that of the mixture.
+    The run starts from the first `n_init` samples, like every free run. If the recording does not start at
+    rest, memories that no sensor shows, such as the state of a friction, are estimated from these samples
+    too. The variance of a sample is the sum of these parts:
 
-    Everything is propagated to first order: not for a run in which a small change of a parameter decides
-    between two motions.
+    - parameters, by the covariance of the fit; the first state follows them;
+    - the first state, by the noise of the samples from which it is estimated;
+    - local parameters of each recording, by their scatter;
+    - process noise, by the linear part of the machine;
+    - the noise of the sensors;
+    - what the model lacks, a constant for each channel. With `known` recordings, it is so large that bands
+      over them contain the share `level` of their samples. Without any, it is the variance of the fit's
+      residuals beyond the sensor noise; or zero for a fit to predictions, whose residuals are no errors of
+      free runs.
+
+    For several models with weights, the band is that of their mixture.
+
+    All parts are propagated to first order. Do not use it for a run in which a small change of a parameter
+    decides between two motions.
 
     Args:
         fitted: A fit; or pairs of a fit and its weight, one for each set of effects that may be true.
-        recording: Its input, its first samples and the noise of its sensors are used, its other samples only
-            by `coverage`.
+        recording: Recording whose input, first samples and sensor noise are used; other samples are used by
+            `coverage` only.
         level: Probability, between 0 and 1.
-        known: Recordings of the same machine by which the error of the model is measured, best some that were
-            not fitted.
+        known: Recordings of the same machine by which the error of the model is measured, preferably
+            recordings that were not fitted.
 
     Raises:
-        InputError: No fit, weights that are not positive, models with other channels; a run that diverges, or
-            whose slopes do (`MOST_RANGES`).
+        InputError: If there is no fit, if weights are not positive, if models have different channels, or if
+            a run or its slopes diverge (`MOST_RANGES`).
 
     Source: L. Ljung, System Identification, 2nd ed., 1999, section 9.4 (propagation of a covariance); V.
     Vovk, A. Gammerman and G. Shafer, Algorithmic Learning in a Random World, 2005 (width by known errors).
@@ -211,8 +220,9 @@ class FitForRun(NamedTuple):
     """A fit as it is used for the recordings of one run.
 
     Attributes:
-        fit: Its model has the values for this run.
-        own: Parameter that belongs to runs -> variance about the value for this one, beside that of the fit.
+        fit: The fit, whose model has the values for this run.
+        own: Local parameter -> variance about its value for this run, in addition to the covariance of the
+            fit.
     """
 
     fit: Fit
@@ -220,12 +230,12 @@ class FitForRun(NamedTuple):
 
 
 class BandSource(NamedTuple):
-    """One of the models that a band is made of.
+    """One of the models from which a band is computed.
 
     Attributes:
-        run: The model for the run of the recording.
-        weight: Probability, up to a factor that all share.
-        known: Recordings by which the error of the model is measured, each with the model for its run.
+        run: The fit for the run of the recording.
+        weight: Probability, up to a common factor.
+        known: Recordings by which the error of the model is measured, each with the fit for its run.
     """
 
     run: FitForRun
@@ -234,14 +244,14 @@ class BandSource(NamedTuple):
 
 
 def scatter(of_runs: Sequence[Estimate], value: float) -> float:
-    """Variance of a parameter of another run about a value, by the estimates of some runs."""
+    """Variance of a parameter in another run about a value, from the estimates of some runs."""
     values = np.array([e.value for e in of_runs])
     variance = float(np.var(values, ddof=1)) if len(values) > 1 else 0.0
     return variance + (float(np.mean(values)) - value) ** 2
 
 
 def checked_level(level: Any) -> float:
-    """The argument `level`, a probability."""
+    """The argument `level`, checked to be between 0 and 1."""
     return checks.number(level, "level", above=0, below=1, example="0.9")
 
 
@@ -279,7 +289,7 @@ def mixed_bands(sources: Sequence[BandSource], recording: Recording, level: floa
 
 
 def known_recordings(known: Any) -> tuple[Recording, ...]:
-    """The recordings of an argument `known`, which may be none."""
+    """The recordings of an argument `known`, which may be empty."""
     none = isinstance(known, Sequence) and len(known) == 0
     return () if none else tuple(listed(known, "known", shortest=SHORTEST_TO_FIT))
 
@@ -288,7 +298,7 @@ def _weighted(fitted: Any) -> list[tuple[Fit, float]]:
     """Fits with their weights.
 
     Raises:
-        InputError: Something else, or models of other channels.
+        InputError: If the argument is neither a fit nor such pairs, or if models have different channels.
     """
     pairs = [(fitted, 1.0)] if isinstance(fitted, Fit) else fitted
     right = isinstance(pairs, Sequence) and all(
@@ -313,7 +323,7 @@ def _weighted(fitted: Any) -> list[tuple[Fit, float]]:
 def _run(
     fit_for_run: FitForRun, recording: Recording
 ) -> tuple[Float[np.ndarray, "N C"], dict[str, np.ndarray]]:
-    """A free run, and the variances of its samples by what is uncertain of machine, start and sensor."""
+    """A free run, and the variances of its samples by parameters, first state, process noise and sensor."""
     fitted, model = fit_for_run.fit, fit_for_run.fit.model
     m = model.at(recording).mechanism
     names = m.parameter_names
@@ -325,7 +335,7 @@ def _run(
     unseen = _unseen(model, recording, start, moving)
 
     def run(state: Float[np.ndarray, " n"]) -> tuple[np.ndarray, np.ndarray]:
-        """Outputs; slopes by parameters, positions, speeds, and by shares of what no sensor shows."""
+        """Outputs; slopes by parameters, by positions and speeds, and by coordinates of unseen states."""
         y_hat, J = _slopes(model, m, recording, state, free)
         with np.errstate(over="ignore", invalid="ignore"):  # of a run that diverges, which is refused below
             return y_hat, np.concatenate([J[..., : F + moving], J[..., F + moving :] @ unseen], axis=-1)
@@ -342,12 +352,12 @@ def _run(
         )
     known = np.array([n in recording.constants for n in fitted.free_names], bool)
     J[..., :F][..., known] = 0.0
-    # The first state is the least-squares answer on the first samples, given the parameters.
+    # The first state is the least-squares estimate from the first samples, given the parameters.
     by, first = J[: recording.n_init, :, :F], J[: recording.n_init, :, F:]
     if unseen.size:
         weight, prior = 1 / noise**2, np.diag([0.0] * moving + [1.0] * unseen.shape[1])
     else:
-        weight, prior = np.ones_like(noise), 0.0  # channels as they are, as a free run starts
+        weight, prior = np.ones_like(noise), 0.0  # unweighted channels, as at the start of a free run
     H = np.einsum("ncs,c,nct->st", first, weight, first) + prior
     inverse = np.linalg.pinv(H, rcond=1e-12, hermitian=True)
     follows = -inverse @ np.einsum("ncs,c,ncp->sp", first, weight, by)
@@ -372,10 +382,10 @@ def _run(
 def _refuse_growing(
     model: Model, recording: Recording, parts: Mapping[str, np.ndarray], ranges: Float[np.ndarray, " C"]
 ) -> None:
-    """Refuse a run whose slopes grow without limit, as those of an unstable machine that friction holds.
+    """Refuse a run whose slopes grow without limit, such as that of an unstable machine held by friction.
 
     Raises:
-        InputError: The standard deviation of a channel is beyond any motion.
+        InputError: If the standard deviation of a channel is far beyond its motion.
     """
     widths = np.sqrt(np.mean(np.sum(list(parts.values()), axis=0), axis=0))
     for channel, width, motion in zip(model.mechanism.channels, widths, ranges, strict=True):
@@ -392,9 +402,9 @@ def _refuse_growing(
 
 
 def _fast_bristles(m: Mechanism, Ts: float) -> str:
-    """The friction with memory that swings too fast for the sampling period, in words; empty if none does.
+    """The friction with memory that oscillates too fast for the sampling period, in words; else empty.
 
-    At rest its torque is that of a spring `k = -(d tau/dz) (d (dz/dt)/d speed)`, which swings with
+    At rest it acts as a spring with stiffness `k = -(d tau/dz) (d (dz/dt)/d speed)`, which oscillates with
     `w = sqrt(k / J)` against the inertia `J` of the port.
     """
     inverse = inverse_mass(m)
@@ -414,13 +424,14 @@ def _fast_bristles(m: Mechanism, Ts: float) -> str:
 def _unseen(
     model: Model, recording: Recording, start: Float[np.ndarray, " n"], moving: int
 ) -> Float[np.ndarray, "h k"]:
-    """Spread of the first states that no sensor shows, such as that of a friction with memory.
+    """Prior spread of the first states that no sensor shows, such as the state of a friction with memory.
 
-    A recording that starts at rest, or goes on where another ended, is taken to start as the model has it.
-    Otherwise these states may be as far from there as they ever are in a run over the recording.
+    If a recording starts at rest, or continues another one, it is assumed to start in the states of the
+    model. Otherwise the spread of these states is the mean square of their deviations in a run over the
+    recording.
 
     Returns:
-        A root of their covariance, without columns where nothing is spread.
+        A root of their covariance, without columns if there is no spread.
     """
     X = model.simulate_states(recording)
     if recording.continues is not None or not np.isfinite(X).all():
@@ -444,21 +455,21 @@ def _first_state(
     n_init: int,
     parameters: int,
 ) -> Float[np.ndarray, " n"]:
-    """The first state that the first samples ask for, memories included.
+    """The first state, memories included, fitted to the first samples.
 
         minimise  sum_k |(y_k - y_hat_k(x0)) / noise|^2 + |c|^2,   x0 = start + (moving, unseen c)
 
-    Where a friction remembers decides how far the machine moves before it slides, so the first samples show
-    it, and a run that starts from none of it is off by a constant ever after.
+    The memory of a friction determines how far the machine moves before it slides, so the first samples
+    contain information on it. A run that starts with a wrong memory has a constant error ever after.
 
     Args:
-        run: Outputs and slopes from a first state.
-        start: Where the search begins.
-        unseen: Root of the covariance of the states that no sensor shows.
-        y: What was measured.
-        noise: Of the sensors.
-        n_init: Samples that may be used.
-        parameters: Columns of the slopes that are of parameters.
+        run: Gives outputs and slopes for a first state.
+        start: Where the fit begins.
+        unseen: Root of the prior covariance of the states that no sensor shows.
+        y: Measured outputs.
+        noise: Standard deviation of the sensor noise.
+        n_init: Number of samples that are used.
+        parameters: Number of columns of the slopes that belong to parameters; they come first.
     """
     moving = len(start) - len(unseen)
 
@@ -475,7 +486,7 @@ def _first_state(
 
     best, least = np.zeros(moving + unseen.shape[1]), np.inf
     axes = np.eye(len(best))[moving:]
-    for x in (0.0 * best, *axes, *-axes):  # a play may rest on either side
+    for x in (0.0 * best, *axes, *-axes):  # for example, play may rest on either side
         cost, e, S = evaluated(x)
         for _ in range(FIRST_STATE_STEPS):
             if not np.isfinite(cost):
@@ -500,7 +511,7 @@ def _first_state(
 
 
 def _finite(covariance: np.ndarray) -> np.ndarray:
-    """A covariance without what has none: parameters that are held at the end of their range."""
+    """A covariance with zeros for parameters that have none, since they are held at an end of their range."""
     return np.where(np.isfinite(covariance), covariance, 0.0)
 
 
@@ -512,7 +523,7 @@ def _propagated(S: Float[np.ndarray, "N C P"], V: Float[np.ndarray, "P P"]) -> F
 def _slopes(
     model: Model, m: Mechanism, recording: Recording, start: np.ndarray, free: np.ndarray
 ) -> tuple[Float[np.ndarray, "N C"], Float[np.ndarray, "N C D"]]:
-    """Outputs of a free run, and slopes by parameters [their units], then by the first state."""
+    """Outputs of a free run, and slopes by the parameters [per unit], then by the first state."""
     layout = RunLayout(m.structure, model.solver, Layout.of(m.structure).size)
     u, Ts = model.inputs(recording), float(recording.Ts)
     y, J = free_run_slopes(layout, m.values, np.ones(len(m.values)), free, start, u, Ts)
@@ -522,7 +533,7 @@ def _slopes(
 def _process_variance(
     m: Mechanism, intensities: dict[str, float], recording: Recording
 ) -> Float[np.ndarray, "N C"]:
-    """Variance of the outputs by white torques from the start on, in the linear part of the machine."""
+    """Variance of the outputs by process noise after the first samples, in the linear part of the machine."""
     ss = linearise(m)
     Ts = float(recording.Ts)
     Ad, _ = ss.discretise(Ts)
@@ -542,12 +553,12 @@ def _process_variance(
 def _lacking(
     source: BandSource, quantile: float, level: float, sensor: Float[np.ndarray, " C"]
 ) -> Float[np.ndarray, " C"]:
-    """Variance of each channel by what the model lacks."""
+    """Variance of each channel that is caused by what the model lacks."""
     fitted = source.run.fit
     residual = np.array([fitted.noise[c] for c in fitted.model.mechanism.channels])
     if not source.known:
         if fitted.options.process_noise is not None:
-            return np.zeros(len(residual))  # predictions leave innovations, which are no errors of a free run
+            return np.zeros(len(residual))  # residuals of predictions are no errors of free runs
         return np.maximum(residual**2 - sensor, 0.0)
     errors, others = [], []
     for run, recording in source.known:
@@ -556,7 +567,7 @@ def _lacking(
         errors.append((run.fit.model.measured(recording).astype(float) - y_hat)[seen])
         others.append(np.sum(list(parts.values()), axis=0)[seen])
     e, v = np.concatenate(errors), np.concatenate(others)
-    # Of each sample the variance with which it would lie on the edge of its band.
+    # For each sample, the additional variance with which it would lie on the edge of its band.
     needed = np.square(e / quantile) - v
     return np.maximum(np.quantile(needed, level, axis=0), 0.0)
 
@@ -568,7 +579,7 @@ def _mixture(
     tail: float,
     quantile: float,
 ) -> tuple[Float[np.ndarray, "N C"], Float[np.ndarray, "N C"]]:
-    """Quantiles of a mixture of normal distributions, by halving."""
+    """Quantiles of a mixture of normal distributions, by bisection."""
     if len(runs) == 1:
         return runs[0] - quantile * std[0], runs[0] + quantile * std[0]
     ends = []

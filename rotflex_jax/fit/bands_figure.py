@@ -1,4 +1,4 @@
-"""Figure of bands: the measured outputs inside of them, and what widens them over time."""
+"""Figure of bands: the measured outputs in their bands, and the sources of uncertainty over time."""
 
 from typing import TYPE_CHECKING
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 @styled
 def bands_figure(bands: "Bands") -> Figure:
-    """Error of the free run inside its band on the left, standard deviations by each cause on the right."""
+    """Error of the free run in its band on the left, standard deviation of each source on the right."""
     figure = blank(10.0, 2.4 * len(bands.channels) + 0.5)
     grid = figure.subplots(len(bands.channels), 2, squeeze=False, sharex=True)
     t = bands.recording.t

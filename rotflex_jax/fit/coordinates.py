@@ -1,8 +1,8 @@
-"""What a fit adjusts, and the block structure of its least-squares problem.
+"""The coordinates of a fit, and the block structure of its least-squares problem.
 
-The coordinates are the parameters that all recordings share, then for each recording its own parameters and
-the first states of its windows. A first state acts within its window alone and an own parameter within its
-recording, so that products and projections are formed block by block.
+The coordinates are the parameters common to all recordings, then for each recording its local parameters and
+the first states of its windows. A first state affects only its window, and a local parameter only its
+recording, so products and projections are formed block by block.
 """
 
 import dataclasses
@@ -14,7 +14,7 @@ from jaxtyping import Float, Int, Shaped
 from rotflex_jax.fit.dataset import Windows
 from rotflex_jax.fit.inference import RecordingSlopes
 
-# A direction of which no more than this share is left after a projection has none of its own.
+# A direction of which no more than this share is left after a projection counts as linearly dependent.
 RANK_TOLERANCE = 1e-10
 
 
@@ -24,13 +24,13 @@ class Point(Protocol):
     __dataclass_fields__: ClassVar[dict[str, Any]]
 
     @property
-    def free(self) -> tuple[int, ...]: ...  # noqa: D102 - parameters that all recordings share
+    def free(self) -> tuple[int, ...]: ...  # noqa: D102 - indices of common parameters
     @property
-    def local(self) -> tuple[int, ...]: ...  # noqa: D102 - those that each recording has for itself
+    def local(self) -> tuple[int, ...]: ...  # noqa: D102 - indices of local parameters
     @property
     def z(self) -> Float[np.ndarray, " P"]: ...  # noqa: D102 - unconstrained values of all parameters
     @property
-    def local_z(self) -> Float[np.ndarray, "R L"]: ...  # noqa: D102 - of the recordings' own
+    def local_z(self) -> Float[np.ndarray, "R L"]: ...  # noqa: D102 - unconstrained local values
     @property
     def x0(self) -> Float[np.ndarray, "R W m"]: ...  # noqa: D102 - first states of the windows
 
@@ -43,10 +43,10 @@ class FitCoordinates:
     """The M coordinates of a fit.
 
     Attributes:
-        shared: How many parameters all recordings share; zero where these are held.
-        local: How many each recording has for itself.
-        states: How many entries a first state has.
-        windows: Where runs start again.
+        shared: Number of parameters common to all recordings; zero if these are held.
+        local: Number of local parameters of each recording.
+        states: Number of entries of a first state.
+        windows: Windows at whose beginnings runs start again.
     """
 
     shared: int
@@ -56,26 +56,26 @@ class FitCoordinates:
 
     @classmethod
     def of(cls, h: Point, windows: Windows) -> "FitCoordinates":
-        """Those of a hypothesis, or of another point."""
+        """The coordinates of a hypothesis, or of another point."""
         return cls(len(h.free), len(h.local), h.x0.shape[-1], windows)
 
     @property
     def directions(self) -> int:
-        """Number of directions of a run, which windows and recordings share."""
+        """Number of directions of a run, the same for all windows and recordings."""
         return self.shared + self.local + self.states
 
     @property
     def size(self) -> int:
-        """M."""
+        """Number M of coordinates."""
         return self._start(len(self.windows.counts))
 
     def _start(self, recording: int) -> int:
-        """First column of what belongs to a recording alone."""
+        """First column of the coordinates of one recording."""
         counts = self.windows.counts[:recording]
         return self.shared + len(counts) * self.local + sum(counts) * self.states
 
     def local_columns(self, recording: int) -> Int[np.ndarray, " L"]:
-        """Columns of a recording's own parameters."""
+        """Columns of the local parameters of a recording."""
         return self._start(recording) + np.arange(self.local)
 
     def state_columns(self, recording: int, window: int) -> Int[np.ndarray, " m"]:
@@ -88,13 +88,13 @@ class FitCoordinates:
         return np.concatenate([np.arange(self.shared), *own])
 
     def of_recording(self, recording: int) -> Int[np.ndarray, " O"]:
-        """Columns of what belongs to one recording alone."""
+        """Columns of the local parameters and first states of one recording."""
         return np.arange(self._start(recording), self._start(recording + 1))
 
     def sums(
         self, w: Float[np.ndarray, "R N C"], W: Float[np.ndarray, "D R N C"]
     ) -> tuple[Float[np.ndarray, "M M"], Float[np.ndarray, " M"]]:
-        """`J'J` and `J'w` of whitened innovations and of their slopes along the directions."""
+        """`J'J` and `J'w` of whitened innovations `w` and their slopes `W` along the directions."""
         H, g = np.zeros((self.size, self.size)), np.zeros(self.size)
         for r in range(len(w)):
             for k, samples in self.windows.of(r):
@@ -110,7 +110,7 @@ class FitCoordinates:
 
         Args:
             e: Errors.
-            J: Their slopes along the directions of each window.
+            J: Slopes of the errors along the directions of each window.
             seen: Not zero where a sample counts.
         """
         found = []
@@ -134,11 +134,10 @@ class FitCoordinates:
         return dataclasses.replace(h, z=z, local_z=local_z, x0=x0)
 
     def step_limit(self, largest: float | Float[np.ndarray, " P"]) -> Float[np.ndarray, " M"]:
-        """Largest step of each coordinate: parameters have one, first states do not.
+        """Largest step of each coordinate; it is infinite for first states.
 
         Args:
-            largest: One for all parameters, or that of each shared one, then of each that recordings have for
-                themselves.
+            largest: Largest step of all parameters; or of each common parameter, followed by each local one.
         """
         each = np.broadcast_to(largest, self.shared + self.local)
         most = np.full(self.size, np.inf)
@@ -148,16 +147,16 @@ class FitCoordinates:
         return most
 
     def orthogonal_to(self, W: Float[np.ndarray, "D R N C"]) -> "Projection":
-        """The projection on what slopes along the directions cannot move."""
+        """The projection that removes what slopes along the directions can explain."""
         return Projection(self, W[: self.directions])
 
 
 class Projection:
-    """Signals less their projection on the slopes along all coordinates of a fit.
+    """Signals without their projection on the slopes along all coordinates of a fit.
 
-    First states are projected out within each window, then own parameters within each recording, then what
-    all share, each from what the ones before have left: together the projection on all of them (theorem of
-    Frisch, Waugh and Lovell).
+    First states are projected out within each window, then local parameters within each recording, then
+    common parameters, each from what is left of the ones before. Together this is the projection on all of
+    them (theorem of Frisch, Waugh and Lovell).
     """
 
     def __init__(self, coordinates: FitCoordinates, W: Float[np.ndarray, "D R N C"]) -> None:
@@ -173,7 +172,7 @@ class Projection:
         self._shared = _basis(left[:shared])
 
     def __call__(self, signals: Float[np.ndarray, "K R N C"]) -> Float[np.ndarray, "K M"]:
-        """What is left of some signals, as rows."""
+        """What is left of some signals after projection, as rows."""
         left = np.array(signals, float)
         self._remove_states(left)
         self._remove_local(left)
@@ -193,7 +192,7 @@ class Projection:
 def orthogonal_to(
     rows: Float[np.ndarray, "K M"], others: Float[np.ndarray, "D M"]
 ) -> Float[np.ndarray, "K M"]:
-    """Rows less their projection on the span of others."""
+    """Rows without their projection on the span of others."""
     left = np.array(rows, float)
     _remove(left, _basis(others))
     return left
@@ -210,6 +209,6 @@ def _basis(rows: np.ndarray) -> np.ndarray:
 
 
 def _remove(signals: np.ndarray, basis: np.ndarray) -> None:
-    """Take the projection on a basis away from signals (K, ...), in place."""
+    """Remove the projection on a basis from signals (K, ...), in place."""
     flat = signals.reshape(len(signals), -1)
     signals -= ((flat @ basis.T) @ basis).reshape(signals.shape)

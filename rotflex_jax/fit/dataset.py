@@ -1,8 +1,8 @@
-"""Recordings prepared for a fit: stacked arrays, sensor noise, sizes of torques, windows with first states.
+"""Recordings prepared for a fit: stacked arrays, sensor noise, torque scale, windows with first states.
 
-A free run is a predictor whose gain is zero. Over a whole recording its error grows with every small error of
-the parameters, so it starts again every few seconds, each time in a first state of its own. Both kinds of
-run go through the same compiled programs, as the window of each sample is data.
+A free run is a predictor with gain zero. Over a whole recording its error grows with every small error of the
+parameters, so it may start again every few seconds, each time from a first state of its own. Both kinds of
+runs use the same compiled programs, since the window of each sample is data.
 """
 
 import dataclasses
@@ -20,16 +20,17 @@ from rotflex_jax.metrics import window_starts
 from rotflex_jax.models.model import Model, program_length
 from rotflex_jax.recording import Recording
 
-# Least number of windows in arrays of programs, where runs start again at all: more cost next to nothing.
+# Least number of windows in arrays of programs, if runs start again at all; more windows cost hardly any
+# time.
 _LEAST_WINDOWS = 16
 
 
 class StackedRecordings(NamedTuple):
-    """Recordings side by side, shorter ones padded with samples that are not `seen`.
+    """Recordings stacked in arrays; shorter ones are padded with samples that do not count.
 
     Attributes:
-        u: Inputs; with the signals of the model's mechanism beside them where it has any.
-        y: Outputs, with the channels that the model has.
+        u: Inputs; if the mechanism has signals, with these in further columns.
+        y: Outputs, in the channels of the model.
         seen: One where a sample counts, zero where it is padding.
         Ts: Sampling periods [s].
     """
@@ -47,15 +48,15 @@ class StackedRecordings(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Dataset:
-    """Recordings with all that a fit of one model needs to know of them beforehand.
+    """Recordings prepared for the fit of one model.
 
     Attributes:
-        recordings: As they were given.
-        data: The same as arrays.
+        recordings: The recordings as they were given.
+        data: The recordings as arrays.
         noise: Standard deviation of the sensor noise of each channel.
         torque_scale: Torque that the motor gives at the root mean square voltage [N m].
-        first_states: First positions and speeds, where a fit starts.
-        constants: Values of the parameters that the recordings know; nan where the model's own counts.
+        first_states: First positions and speeds from which a fit starts.
+        constants: Constants of the recordings; nan for parameters that have the value of the model.
     """
 
     recordings: tuple[Recording, ...]
@@ -77,14 +78,15 @@ def prepare(
     """Recordings prepared for a model.
 
     Args:
-        model: Its channels, its motor and its coordinates count.
-        recordings: One or several.
+        model: The model, which gives channels, motor and coordinates.
+        recordings: One or several recordings.
         length: Least number of samples of the arrays, so that other recordings share compiled code.
-        noise_of: Further recordings of the same sensors, from which their noise is estimated as well.
-        like: Data set whose sensor noise and torque scale are taken over.
+        noise_of: Further recordings of the same sensors, from which the noise is estimated as well.
+        like: Dataset whose sensor noise and torque scale are taken over.
 
     Raises:
-        InputError: No recording, one without a channel of the model, or a channel that never moves.
+        InputError: If there is no recording, if a recording lacks a channel of the model, or if a channel
+            never moves.
     """
     data = stack(recordings, model, length)
     if like is None:
@@ -100,10 +102,10 @@ def prepare(
 
 
 def check_moving(model: Model, recordings: Sequence[Recording]) -> None:
-    """Refuses recordings in which a channel of the model has one value: its noise would be zero.
+    """Refuse recordings in which a channel of the model never moves: its noise would be zero.
 
     Raises:
-        InputError: With the channel.
+        InputError: If a channel has the same value in all recordings.
     """
     whole = np.concatenate([model.measured(r) for r in recordings])
     still = [c for c, y in zip(model.mechanism.channels, whole.T, strict=True) if np.ptp(y) == 0]
@@ -115,10 +117,10 @@ def check_moving(model: Model, recordings: Sequence[Recording]) -> None:
 
 
 def known_values(model: Model, recordings: Sequence[Recording]) -> Float[np.ndarray, "R P"]:
-    """Values of the parameters that the recordings know, nan where the model's own counts.
+    """Constants of the recordings; nan for parameters that have the value of the model.
 
     Raises:
-        InputError: A parameter that is free in the model.
+        InputError: If a constant belongs to a parameter that is free in the model.
     """
     names = model.mechanism.parameter_names
     known = np.full((len(recordings), len(names)), np.nan)
@@ -136,10 +138,10 @@ def known_values(model: Model, recordings: Sequence[Recording]) -> Float[np.ndar
 
 
 def with_common_constants(model: Model, recordings: Sequence[Recording]) -> Model:
-    """The model with the constants that all recordings share.
+    """The model with the constants of the recordings, which must be the same in all of them.
 
     Raises:
-        InputError: Constants that differ between recordings.
+        InputError: If constants differ between recordings.
     """
     known = known_values(model, recordings)
     differ = ~np.all((known == known[:1]) | np.isnan(known) & np.isnan(known[:1]), axis=0)
@@ -153,9 +155,9 @@ def with_common_constants(model: Model, recordings: Sequence[Recording]) -> Mode
 
 
 def padded_length(recordings: Sequence[Recording]) -> int:
-    """A length of arrays that recordings of nearby lengths share, and with it the compiled code.
+    """A length of arrays that recordings of similar lengths have in common, so that they share compiled code.
 
-    The longest, rounded up to one of eight lengths between powers of two: 1/16 more on average.
+    It is the longest length, rounded up to one of eight lengths between powers of two: 1/16 more on average.
     """
     longest = max((r.N for r in recordings), default=0)
     step = 2 ** max(0, longest.bit_length() - 4)
@@ -163,12 +165,12 @@ def padded_length(recordings: Sequence[Recording]) -> int:
 
 
 def padded_windows(number: int) -> int:
-    """A number of windows in arrays that runs with about as many share, and with it the compiled code."""
+    """A number of windows in arrays that runs with similar numbers have in common, to share programs."""
     return program_length(number, _LEAST_WINDOWS)
 
 
 def stack(recordings: Sequence[Recording], model: Model, length: int | None = None) -> StackedRecordings:
-    """Recordings as arrays, float64, with the channels the model has; of the given length at least."""
+    """Recordings as float64 arrays, with the channels of the model and at least the given length."""
     if not recordings:
         raise InputError("No recording was given, but at least one is needed; pass a Recording.")
     N = max(length or 0, *(r.N for r in recordings))
@@ -183,7 +185,7 @@ def stack(recordings: Sequence[Recording], model: Model, length: int | None = No
 
 
 def first_states(model: Model, recordings: Sequence[Recording]) -> Float[np.ndarray, "R n"]:
-    """First positions and speeds (R, 2 n): straight lines through the first samples, where a fit starts."""
+    """First positions and speeds (R, 2 n) for the start of a fit, by straight lines through first samples."""
     heads = [model.measured(r)[: r.n_init].astype(float) for r in recordings]
     structure = model.mechanism.structure
     return np.concatenate(
@@ -192,17 +194,18 @@ def first_states(model: Model, recordings: Sequence[Recording]) -> Float[np.ndar
 
 
 def sensor_noise(recordings: Sequence[Recording], model: Model) -> Float[np.ndarray, " C"]:
-    """Standard deviation of the sensor noise per channel (C,), from residuals of local polynomials.
+    """Standard deviation of the sensor noise of each channel (C,), from residuals of local polynomials.
 
-    A cubic through 11 neighbouring samples follows the motion; what it leaves is noise. Where a period
-    of the motion is but a few samples long, only a higher degree follows it: the least of several counts.
-    Never less than the rounding to steps of `resolution` leaves, step / sqrt(12).
+    A cubic polynomial over 11 neighbouring samples follows the motion, and its residuals are noise. If a
+    period of the motion has only a few samples, only a higher degree follows it, so the least value of
+    several degrees is taken. It is never less than the error of rounding to steps of `resolution`, step /
+    sqrt(12).
     """
     return np.min([_left_by(degree, recordings, model) for degree in (3, 5, 7, 9)], axis=0)
 
 
 def _left_by(degree: int, recordings: Sequence[Recording], model: Model) -> np.ndarray:
-    """Standard deviation that local polynomials of a degree leave, if all of it were white noise."""
+    """Standard deviation of white noise that would leave these residuals of local polynomials of a degree."""
     half = 5
     t = np.arange(-half, half + 1) / half
     V = np.vander(t, degree + 1)
@@ -221,7 +224,7 @@ def _left_by(degree: int, recordings: Sequence[Recording], model: Model) -> np.n
 
 
 def process_noise_ports(m: Mechanism, intensity: float) -> dict[str, float]:
-    """The same intensity along every coordinate; ports that move one coordinate each."""
+    """Process noise of the same intensity at the fewest ports whose torques drive every coordinate."""
     chosen: dict[str, float] = {}
     span = np.zeros((0, len(m.coordinates)))
     for port, vector in m.port_vectors.items():
@@ -241,12 +244,12 @@ def torque_scale(m: Mechanism, data: StackedRecordings) -> float:
 
 @dataclasses.dataclass(frozen=True)
 class Windows:
-    """The windows of some recordings, their number filled up to the same W in all of them.
+    """The windows of some recordings, filled up to the same number W in all of them.
 
     Attributes:
         index: Window of each sample.
-        counts: How many windows each recording has.
-        first_states: First positions and speeds, where a fit starts.
+        counts: Number of windows of each recording.
+        first_states: First positions and speeds of each window, from which a fit starts.
     """
 
     index: Int[np.ndarray, "R N"]
@@ -261,11 +264,11 @@ class Windows:
 
     @classmethod
     def of_seconds(cls, model: Model, dataset: Dataset, seconds: float) -> "Windows":
-        """Windows of some seconds, as errors over windows have them.
+        """Windows of some seconds, the same as for errors over windows.
 
         Args:
-            model: Its channels count.
-            dataset: What is cut.
+            model: The model, which gives the channels.
+            dataset: The recordings.
             seconds: Length of a window [s].
         """
         starts = [window_starts(r, seconds)[0] for r in dataset.recordings]
@@ -281,14 +284,14 @@ class Windows:
         return cls(index, counts, first)
 
     def filled_up(self, number: int) -> "Windows":
-        """The same in arrays for at least so many windows, so that runs with more of them share programs."""
+        """The same windows in arrays for at least this number, to share programs with other runs."""
         more = max(number - self.number, 0)
         last = np.repeat(self.first_states[:, -1:], more, axis=1)
         return dataclasses.replace(self, first_states=np.concatenate([self.first_states, last], axis=1))
 
     @property
     def number(self) -> int:
-        """W."""
+        """Number W of windows in the arrays."""
         return self.first_states.shape[1]
 
     def of(self, recording: int) -> Iterator[tuple[int, slice]]:

@@ -1,14 +1,14 @@
-"""How far the step of integration shifts the estimates of a fit, and what is said of it.
+"""Discretisation bias: how far the integration step shifts the estimates of a fit, and a remark on it.
 
-Dry friction that stops and lets go within a sample is integrated coarsely by one step per sample. One run in
-shorter steps from the optimum shows what that does to the estimates, to first order, and a second run what
-it does to the cost where one of them moves far:
+Dry friction that sticks and slips within a sample is integrated coarsely by one step per sample. One run with
+shorter steps from the optimum gives the shift of the estimates, to first order. If an estimate shifts far, a
+second run gives the change of the cost:
 
     shift = (J'J)^-1 J'(e - e_fine)
 
 with the scaled errors `e` of the fit, their slopes `J` and the errors `e_fine` of shorter steps with the same
-parameters and first states. The shift is that of the steps alone: what is left of the gradient at the end of
-a fit has no part in it.
+parameters and first states. The shift is caused by the steps alone: the gradient that remains at the end of a
+fit does not contribute.
 """
 
 import dataclasses
@@ -26,21 +26,21 @@ from rotflex_jax.mechanism.finer_step import SUBSTEP_FACTOR, with_finer_steps
 from rotflex_jax.text.numbers import plain_number
 
 COARSE_STEP = "step of integration"
-"""Kind of a remark on steps that are too long for an estimate."""
+"""Kind of a remark on integration steps that are too long for an estimate."""
 
-# A shift by as much as a standard deviation counts: an interval of 95 % that is off by so much holds the true
-# value in 83 of 100 cases.
+# A shift counts from this many standard deviations on: a 95 % interval that is shifted by one standard
+# deviation contains the true value in 83 of 100 cases.
 LARGE_SHIFT = 1.0
 
 
 @dataclasses.dataclass(frozen=True)
 class FinerSteps:
-    """What an integration in shorter steps does to a fit.
+    """Effect of shorter integration steps on a fit.
 
     Attributes:
-        solver: With the shorter steps.
-        shift: Of each coordinate, in standard deviations of the fit; nan for one without.
-        fall: By how much the negative log-likelihood falls with them [nat].
+        solver: Integration rule with the shorter steps.
+        shift: Shift of each coordinate, in standard deviations of the fit; nan for a coordinate without one.
+        fall: Decrease of the negative log-likelihood with the shorter steps [nat].
     """
 
     solver: Exponential
@@ -57,16 +57,16 @@ def finer_steps(
     H: Float[np.ndarray, "F F"],
     covariance: Float[np.ndarray, "M M"],
 ) -> FinerSteps | None:
-    """The integration of a fit in shorter steps; None where steps are exact and where no estimate moves far.
+    """Effect of shorter integration steps on a fit; None if there are none, or if no estimate shifts far.
 
     Args:
-        problem: What was fitted to what.
+        problem: The problem of the fit.
         end: The optimum.
-        e: Errors there.
-        scale: Of each channel.
-        parts: Scaled errors and slopes of the windows, by the coordinates that move.
+        e: Errors at the optimum.
+        scale: Scale of each channel.
+        parts: Scaled errors and slopes of the windows, for the coordinates that move.
         H: Their curvature.
-        covariance: Of all coordinates; nan for those that are held.
+        covariance: Covariance of all coordinates; nan for coordinates that are held.
     """
     solver = with_finer_steps(problem.layout.solver, problem.model.mechanism.effects)
     if solver is None or not np.isfinite(H).all():
@@ -77,9 +77,9 @@ def finer_steps(
     if not np.isfinite(fine).all():
         return None
     coordinates, seen = problem.coordinates(end.point, end.stage.windows), problem.dataset.data.seen
-    # Of coordinates that an end of their range holds there are no slopes.
+    # Coordinates that are held at an end of their range have no slopes in `parts`.
     moves = ~problem.held_by_ends(end.point, end.stage.windows)
-    none = np.zeros((*e.shape, 0))  # of the differences no slopes are wanted, but what is of which window
+    none = np.zeros((*e.shape, 0))  # no slopes of the differences: `parts` only divides them into windows
     gradient = np.zeros(len(H))
     for part, change in zip(parts, coordinates.parts((fine - e) / scale, none, seen), strict=True):
         gradient[part.columns] += part.J.reshape(-1, len(part.columns)).T @ change.e.ravel()
@@ -98,14 +98,14 @@ def finer_steps(
 def coarse_step(
     found: FinerSteps | None, parameters: Sequence[tuple[str, Sequence[int]]]
 ) -> tuple[Remark, ...]:
-    """That steps are too long for the estimates; nothing where these move little.
+    """A remark that integration steps are too long for the estimates; none if these shift little.
 
-    Nothing either where the recordings are less likely with shorter steps: such data were simulated in
-    the steps of the fit, and are best fitted in these.
+    There is no remark either if the recordings are less likely with shorter steps: such data were simulated
+    with the steps of the fit, and are fitted best with these.
 
     Args:
-        found: What shorter steps do.
-        parameters: Free parameters by full name, each with the numbers of its coordinates.
+        found: Effect of shorter steps.
+        parameters: Free parameters by full name, each with the indices of its coordinates.
     """
     if found is None or not found.fall >= 0 or not parameters:
         return ()
@@ -130,7 +130,7 @@ def coarse_step(
 
 
 def _cost(problem: GreyBoxProblem, e: Float[np.ndarray, "R N C"]) -> float:
-    """Negative log-likelihood of errors, constants left out [nat]; infinite where a run diverges."""
+    """Negative log-likelihood of errors, without constants [nat]; infinite if a run diverges."""
     samples = int(np.count_nonzero(problem.dataset.data.seen))
     cost, _ = negative_log_likelihood(e, samples, LEAST_SCALE * problem.dataset.noise)
     return cost if np.isfinite(cost) else np.inf

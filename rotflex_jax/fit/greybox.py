@@ -45,16 +45,17 @@ def report(
     J: Float[np.ndarray, "R N C D"],
     options: FitOptions | None = None,
 ) -> Fit:
-    """Estimates with intervals.
+    """The result of a fit: estimates with intervals.
 
-    A parameter at the end of its range is held there: the others have the intervals that go with that.
+    A parameter at an end of its range is held there, and intervals of other parameters are conditional on
+    that.
 
     Args:
-        problem: What was fitted to what.
+        problem: The problem of the fit.
         end: The optimum.
-        e: Errors there.
-        J: Their slopes by the directions of each recording.
-        options: How the fit was asked for; the defaults if None.
+        e: Errors at the optimum.
+        J: Slopes of the errors along the directions of each recording.
+        options: Options of the fit; the defaults if None.
     """
     model, data, point, windows = problem.model, problem.dataset.data, end.point, end.stage.windows
     m, coordinates, seen = model.mechanism, problem.coordinates(point, windows), data.seen > 0
@@ -119,7 +120,7 @@ def report(
 
 
 def _spread_out(covariance: np.ndarray, moves: np.ndarray) -> np.ndarray:
-    """The covariance of all coordinates, nan for those that are held."""
+    """The covariance of all coordinates, nan for coordinates that are held."""
     whole = np.full((len(moves), len(moves)), np.nan)
     whole[np.ix_(moves, moves)] = covariance
     return whole
@@ -146,61 +147,63 @@ def fit(
 
         minimise  sum_k |(y_k - y_hat_k) / s|^2   over free parameters and first states
 
-    `y_hat` is a free run, or, with `process_noise`, the prediction of a steady Kalman filter whose
-    model admits white torques of that intensity. A free run asks the model to be right over the whole
-    recording; where physics is missing, it biases the parameters to hide that, and a prediction biases
-    them less. The scale `s` of each channel is the standard deviation of its residuals, at every step of the
-    fit.
+    `y_hat` is a free run, or, with `process_noise`, the prediction of a steady-state Kalman filter that
+    assumes white torques of this intensity. In a free run the model must be right over the whole recording.
+    Where physics is missing, the parameters are biased to compensate for it; predictions bias them less. The
+    scale `s` of each channel is the standard deviation of its residuals, at every step of the fit.
 
-    Free runs of a machine that the model does not know wholly have many local minima of the cost: friction
-    that stops a little earlier shifts all that follows. Where the first attempt starts far from the motion,
-    or does not converge, a second one begins with short predictions, which are easy to match from far away.
-    Where errors of free runs are then far above the noise, or no attempt has converged, the fit restarts:
-    from the same parameters with free runs of 0.2 s (longer where there would be more than 200 of them), then
-    of longer ones up to what was asked for; after that from random parameters around the best end, by turns
-    near it and far from it, until three ends have the same cost. The end with the least cost counts.
+    If the model of a machine is incomplete, the cost of free runs has many local minima: friction that stops
+    a little earlier shifts everything that follows. If the first attempt starts far from the motion, or does
+    not converge, a second attempt begins with short predictions, which are easy to match from far away. If
+    errors of free runs are then still far above the noise, or no attempt has converged, the fit restarts. The
+    first restart begins at the same parameters with free runs of 0.2 s (longer if there would be more than
+    200 of them), and goes on with longer free runs up to the length of the fit. Further restarts begin at
+    random parameters around the best end, alternately near it and far from it, until three ends have the same
+    cost. The end with the least cost is the result.
 
-    A fit has converged where steps bring less than a small part of a standard deviation of the parameters;
-    errors that go on for many samples make that many nats. Parameters stay within the physical range that
-    their effects declare, a damper as far as the damping of its port is not negative; one that is at the end
-    of its range, or a size far beyond what the recordings reach, is named in `remarks`.
+    A fit has converged if steps bring less than a small part of a standard deviation of the parameters. If
+    errors are correlated over many samples, this corresponds to as many nats. Parameters stay within the
+    physical range that their effects declare; a damper may be negative as long as the damping of its port is
+    not. A parameter at an end of its range, or of a size far beyond what the recordings reach, is named in
+    `remarks`.
 
-    One step of integration per sample is too long for some effects, dry friction first of all. Where an
-    estimate would move by more than a standard deviation with shorter steps, and the recordings are no less
-    likely with them, `remarks` says so and what to give; the fit itself keeps the steps that were asked for.
+    One integration step per sample is too long for some effects, above all for dry friction. If an estimate
+    would move by more than a standard deviation with shorter steps, and the recordings are no less likely
+    with them, `remarks` names the settings to use. The fit itself keeps its steps.
 
     Args:
-        mechanism: What to fit; its values are the start, its trusted parameters are held.
-        recordings: One or several; parameters are common, first states are each recording's own.
-        process_noise: Port -> intensity of the process torque [(N m)^2 s]; None for a free run.
-        local: Full names of parameters that each recording has for itself, an offset for instance.
-        first: Whether first states are fitted, or held at what the first `n_init` samples show: where
-            nothing pulls the machine back, a free first position hides a drift of the model.
-        window_seconds: Start again every so often [s], each time with a first state of its own: the
-            parameters with which free runs of that length are best. Delays and lags go on across windows, and
-            memories begin as a run over the whole recording leaves them, as in the errors over windows.
-        robust: Errors beyond this many standard deviations count by their size and not by its square, 1.5 for
-            instance, where the model is far off for some of the time and should be right for the rest. The
-            standard deviation follows from the median of the errors; `noise` and intervals are those of
-            errors that are bent so. None for squares throughout.
-        max_steps: Most iterations of each minimisation, of which there are several.
-        restarts: Most restarts of a free run; 0 for none, several times as fast. Predictions and robust fits
-            make none.
-        minimiser: Solver of optimistix in the place of the toolkit's own Levenberg-Marquardt, for instance
+        mechanism: Mechanism to fit; its values are the start, and its trusted parameters are held.
+        recordings: One or several recordings. Parameters are common, and each recording has its own first
+            state.
+        process_noise: Port -> intensity of the process noise [(N m)^2 s]; None for a free run.
+        local: Full names of parameters that have a value for each recording, such as an offset.
+        first: "fitted" to fit first states; "measured" to hold them at what the first `n_init` samples show.
+            Where nothing returns the machine to a position, fitted first states hide a drift of the model.
+        window_seconds: Length of windows after which free runs start again [s], each time from a first state
+            of its own. Delays and lags continue across windows, and memories start from the values that a run
+            over the whole recording has there, as in the errors over windows.
+        robust: Errors beyond this many standard deviations count linearly and not by their square. Use it,
+            for instance with 1.5, if the model is far off for some of the time and should be right for the
+            rest. The standard deviation follows from the median of the errors; `noise` and intervals are
+            computed from the errors bent in this way. None for squares throughout.
+        max_steps: Largest number of iterations of each minimisation, of which there are several.
+        restarts: Largest number of restarts of a fit to free runs; 0 for none, which is several times as
+            fast. Fits to predictions and robust fits have none.
+        minimiser: Solver of optimistix that replaces the toolkit's own Levenberg-Marquardt, for instance
             `optimistix.Dogleg(rtol=1e-6, atol=1e-6)`.
-        devices: Those of this process that several recordings are shared out to; all of them if None, unless
-            `jax.default_device` names one.
+        devices: Devices of this process among which several recordings are divided; all of them if None,
+            unless `jax.default_device` names one.
         progress: Called with a line of text now and then.
-        throw: Raise instead of reporting a failure in `status`.
+        throw: Raise an error instead of reporting a failure in `status`.
 
     Returns:
-        Fit, whose model has the fitted parameters, of a local one the mean over recordings;
-        `local` has each recording's own and `model_of` the model with them.
+        Fit, whose model has the fitted parameters, and for a local parameter the mean over recordings.
+        `local` has the values of each recording, and `model_of` gives the model with them.
 
     Raises:
-        InputError: Nothing to fit, a local name that is not a free parameter, or a channel that moves
+        InputError: If there is nothing to fit, if a local name is no free parameter, or if a channel moves
             against the model.
-        RuntimeError: The fit failed and `throw` is set.
+        RuntimeError: If the fit failed and `throw` is set.
     """
     model = Model.of(mechanism)
     given = list(listed(recordings, shortest=SHORTEST_TO_FIT))
@@ -234,7 +237,7 @@ def fit(
     if window_seconds is not None:
         checks.positive(window_seconds, "window_seconds", "s", "2.0, or None for whole recordings")
     check_signs(model, given)
-    # A robust fit only begins with squares, where large errors would ask for restarts in vain.
+    # A robust fit only begins with squares, and its large errors would cause restarts in vain.
     problem = _problem(model, given, first, max_steps, 0 if robust else restarts, minimiser, devices, say)
     asked = None if process_noise is None else dict(process_noise)
     options = FitOptions(asked, local, first, window_seconds, max_steps, problem.restarts)
@@ -250,14 +253,14 @@ def fit(
 
 
 def problem_of(fitted: Fit, recordings: Sequence[Recording]) -> tuple[GreyBoxProblem, FitPoint, FitStage]:
-    """The problem that a fit has solved, its parameters with first states where fits start, and the stage.
+    """The problem that a fit has solved, a start with its parameters, and the stage.
 
     Args:
         fitted: A fit.
-        recordings: Those that were fitted.
+        recordings: The recordings that were fitted.
 
     Raises:
-        InputError: Other recordings, or another number of them.
+        InputError: If the recordings are not those that were fitted.
     """
     asked, m = fitted.options, fitted.model.mechanism
     own = fitted.local.values()

@@ -1,4 +1,4 @@
-"""What a grey-box fit solves, by damped least squares: free runs or predictions, in stages, within bounds."""
+"""The problem of a grey-box fit: damped least squares on free runs or predictions, in stages and bounds."""
 
 import dataclasses
 import functools
@@ -44,42 +44,44 @@ if TYPE_CHECKING:
     from rotflex_jax.fit.optimistix_adapter import Minimiser
 
 ProcessNoise = Mapping[str, float] | None
-"""Port -> intensity of the process torque [(N m)^2 s]; None for a free run."""
+"""Port -> intensity of the process noise [(N m)^2 s]; None for a free run."""
 
-# A step that would lower the negative log-likelihood by less than this is not taken [nat]. A relative
-# tolerance would stop a long recording many nats short of the optimum. A stage that only leads to the next
-# one may stop earlier.
+# A step is not taken if it would lower the negative log-likelihood by less than this [nat]. A relative
+# tolerance would stop the fit of a long recording many nats short of the optimum. An early stage only leads
+# to the next one and may stop earlier.
 LAST_STAGE_TOLERANCE, EARLY_STAGE_TOLERANCE = 1e-3, 1.0
 
-# A fit also ends where so many steps lower the cost by less than this [nat]: along a curved minimum, or
+# A fit also ends if this number of steps lowers the cost by less than this [nat], as along a curved valley or
 # towards a bound.
 PROGRESS_STEPS, LEAST_PROGRESS = 8, 0.1
 
-# States that the first samples show, or that a run over the whole recording leaves in memories, follow the
-# parameters: the last stage is repeated with new ones until they converge, at least and at most so often.
+# Measured first states, and memories from a run over the whole recording, depend on the parameters. The last
+# stage is repeated with new ones until the cost converges: least and largest number of repetitions, and the
+# least gain that is worth a further one [nat].
 LEAST_REPETITIONS, MOST_REPETITIONS, SETTLED = 4, 6, 0.1
 
-# The scale of a channel is this share of the sensor's noise at least.
+# Least scale of a channel, as a share of the sensor noise.
 LEAST_SCALE = 0.1
 
-# A start is far where its run misses a channel by more than this share of the channel's standard deviation.
+# A start is far off if the error of its run in a channel exceeds this share of the channel's standard
+# deviation.
 FAR_START_ERROR = 0.7
 
-# Horizons on the way to a long one: the first [s], how many times longer the next is, and the largest share
-# of the long one that is worth a stage. The first is longer where there would be more windows than this: each
-# has a first state that is eliminated from each step.
+# Shorter horizons before a long one: the first [s], the factor to the next, and the largest share of the long
+# one that is worth a stage. The first is longer if there would be more windows than the last number, since
+# the first state of each window is eliminated from each step.
 SHORTEST_HORIZON, NEXT_HORIZON, LONGEST_SHARE, MOST_WINDOWS = 0.2, 10**0.5, 0.75, 200
 
-# An end is one where the slopes promise no more than this share of a nat for each coordinate.
+# A fit counts as converged only if the quadratic model promises no more than this per coordinate [nat].
 RUGGED = 0.5
 
-# Of two attempts whose costs differ by less, one that converged is better [nat].
+# If the costs of two attempts differ by less than this [nat], an attempt that converged is better.
 EQUAL_COST = 0.1
 
-# How often a robust fit determines which errors are large.
+# Number of times that a robust fit determines which errors are large.
 ROBUST_REPETITIONS = 2
 
-# Standard deviation of a normal number, by the median of its size.
+# Standard deviation of a normal distribution over the median of the absolute value.
 NORMAL_PER_MEDIAN = 1.4826
 
 _STATUS = {
@@ -101,21 +103,21 @@ def bent(
 
 
 def _joined(results: Sequence[Any]) -> Any:
-    """Results of all recordings, NumPy arrays, in the place of those of each call of a program."""
+    """Results of several calls of a program, joined along the recordings, as NumPy arrays."""
     first, *others = jax.device_get(results)
     return jax.tree.map(lambda *parts: np.concatenate(parts), first, *others) if others else first
 
 
 @dataclasses.dataclass(frozen=True)
 class FitPoint:
-    """Where a fit is.
+    """A point of a fit: its parameters and first states.
 
     Attributes:
-        free: Parameters that all recordings share and that are fitted.
-        local: Fitted parameters that each recording has for itself.
+        free: Indices of fitted parameters that are common to all recordings.
+        local: Indices of fitted parameters that have a value for each recording.
         z: Unconstrained values of all parameters.
-        local_z: Of the recordings' own.
-        x0: First states of the windows, complete.
+        local_z: Unconstrained values of the local parameters of each recording.
+        x0: First states of the windows, with all states of the mechanism.
     """
 
     free: tuple[int, ...]
@@ -127,11 +129,11 @@ class FitPoint:
 
 @dataclasses.dataclass(frozen=True)
 class FitStage:
-    """What is fitted in one stage: free runs of some length, or predictions.
+    """One stage of a fit: free runs of some length, or predictions.
 
     Attributes:
-        windows: Where runs start again.
-        process_noise: Of the predictor; None for free runs.
+        windows: Windows at whose beginnings runs start again.
+        process_noise: Process noise of the predictor; None for free runs.
     """
 
     windows: Windows
@@ -140,17 +142,17 @@ class FitStage:
 
 @dataclasses.dataclass(frozen=True)
 class FitAttempt:
-    """Where a sequence of stages ended.
+    """The end of a sequence of stages.
 
     Attributes:
-        point: The parameters and first states.
-        stage: The last one.
+        point: Parameters and first states at the end.
+        stage: The last stage.
         K: Gains of the last runs.
         status: "converged", or why not.
-        steps: Iterations.
-        history: Negative log-likelihood after each minimisation, constants left out [nat].
+        steps: Number of evaluations.
+        history: Negative log-likelihood after each minimisation, without constants [nat].
         start_error: Error of the run at the start, as a share of the standard deviation of each channel.
-        cost: Negative log-likelihood, constants left out; infinite if diverged.
+        cost: Negative log-likelihood, without constants [nat]; infinite if diverged.
     """
 
     point: FitPoint
@@ -164,30 +166,30 @@ class FitAttempt:
 
     @property
     def rank(self) -> float:
-        """Smaller for a better attempt."""
+        """Sort key of attempts: the smaller, the better."""
         return self.cost + EQUAL_COST * (self.status != "converged")
 
     @property
     def doubtful(self) -> bool:
-        """Whether another way may end better: the start was far away, or this way did not converge."""
+        """Whether another attempt may end better: the start was far off, or this attempt did not converge."""
         return self.status != "converged" or not np.all(self.start_error <= FAR_START_ERROR)
 
 
 @dataclasses.dataclass(frozen=True)
 class GreyBoxProblem:
-    """What is fitted to what, and how.
+    """A model, the recordings to which it is fitted, and the settings of the fit.
 
     Attributes:
         model: Mechanism and solver.
         dataset: The recordings.
-        layout: What runs are compiled for.
+        layout: Static data for which runs are compiled.
         ranges: Least and largest unconstrained value of each parameter.
-        max_steps: Most iterations of a minimisation.
-        restarts: Most restarts.
+        max_steps: Largest number of iterations of a minimisation.
+        restarts: Largest number of restarts.
         minimiser: Solver of optimistix, or None for the toolkit's own.
         say: Called with lines of progress.
-        bend: Errors of each channel beyond which they count by their size; None where all count by their
-            square.
+        bend: Size of an error in each channel beyond which errors count linearly and not by their square;
+            None if all errors count by their square.
     """
 
     model: Model
@@ -201,7 +203,7 @@ class GreyBoxProblem:
     bend: Float[np.ndarray, " C"] | None
 
     def start(self, local: Sequence[int], windows: Windows) -> FitPoint:
-        """The point of the model as it is."""
+        """The point with the values of the model."""
         m = self.model.mechanism
         free = tuple(m.parameter_names.index(name) for name in m.free_names)
         z = np.clip(self.transform.unconstrain(m.values), *self.ranges)
@@ -213,7 +215,7 @@ class GreyBoxProblem:
 
     @property
     def transform(self) -> Transform:
-        """Unconstrained <-> physical, by the declared bounds."""
+        """Transform between physical values and unconstrained coordinates, by the declared bounds."""
         return Transform.of(self.model.mechanism.parameter_specifications)
 
     def physical(self, point: FitPoint) -> tuple[Float[np.ndarray, "R P"], Float[np.ndarray, "R P"]]:
@@ -228,17 +230,17 @@ class GreyBoxProblem:
         return np.where(known, self.dataset.constants, values), np.where(known | held, 0.0, slopes)
 
     def common(self, values: Float[np.ndarray, "R P"]) -> Float[np.ndarray, " P"]:
-        """Means over recordings; what is trusted is the mechanism's own, whatever a recording knows of it."""
+        """Means of values over recordings; trusted parameters have the values of the mechanism."""
         m = self.model.mechanism
         free = np.array([name not in m.trusted for name in m.parameter_names])
         return np.where(free, values.mean(axis=0), m.values)
 
     def coordinates(self, point: FitPoint, windows: Windows) -> FitCoordinates:
-        """What moves."""
+        """The coordinates of the fit."""
         return FitCoordinates(len(point.free), len(point.local), self.layout.states, windows)
 
     def attempt(self, point: FitPoint, stages: Sequence[FitStage]) -> FitAttempt:
-        """One stage after the other, from a start; each but the last only until it is near its end."""
+        """Fit one stage after the other, from a start; stages before the last end with a coarse tolerance."""
         history, steps, status = [], 0, "converged"
         start_error = np.full(len(self.dataset.noise), np.inf)
         for number, stage in enumerate(stages):
@@ -258,9 +260,9 @@ class GreyBoxProblem:
                 if not history:
                     start_error = found.first.scale / self._spread
                 if follows:
-                    # What counts is the run from the states that go with these parameters.
+                    # The run from the first states that belong to these parameters counts.
                     point = self._with_shown_states(point, stage)
-                if renews:  # and the prediction with the gain that goes with them
+                if renews:  # likewise the prediction with the gain that belongs to them
                     K = self._gains(point, stage)
                 if follows or renews:
                     cost = self.equations(point, stage, K).cost
@@ -268,7 +270,7 @@ class GreyBoxProblem:
                 if best is None or cost < best[0]:
                     best = cost, point, K, status
                 worth = repetition + 1 < LEAST_REPETITIONS or history[-1] < history[-2] - SETTLED
-                # Without a step, what follows the parameters is what it was.
+                # Without a step, first states and gains have not changed either.
                 if status != "converged" or not moved or not worth:
                     break
             assert best
@@ -277,7 +279,7 @@ class GreyBoxProblem:
         return FitAttempt(point, stage, K, status, steps, history, start_error, cost)
 
     def _status(self, found: Minimum) -> str:
-        """How a minimisation ended, in words."""
+        """The status of a minimisation, in words."""
         status = _STATUS.get(found.status, f"stopped after {self.max_steps} steps")
         if status != "converged":
             return status
@@ -292,14 +294,14 @@ class GreyBoxProblem:
 
     @functools.cached_property
     def _spread(self) -> Float[np.ndarray, " C"]:
-        """Standard deviation of each channel."""
+        """Standard deviation of each measured channel, at least the noise."""
         seen = self.dataset.data.seen > 0
         return np.maximum(np.std(self.dataset.data.y[seen], axis=0), self.dataset.noise)
 
     def equations(
         self, point: FitPoint, stage: FitStage, K: Float[np.ndarray, "R n C"]
     ) -> LikelihoodEquations:
-        """Likelihood and its quadratic model at a point."""
+        """Negative log-likelihood at a point and its quadratic model."""
         e, J = self.errors(point, stage, K)
         return likelihood_equations(
             self.coordinates(point, stage.windows),
@@ -313,7 +315,7 @@ class GreyBoxProblem:
     def errors(
         self, point: FitPoint, stage: FitStage, K: Float[np.ndarray, "R n C"]
     ) -> tuple[Float[np.ndarray, "R N C"], Float[np.ndarray, "R N C D"]]:
-        """Errors of the runs and their slopes, bent where large ones count less; zero where none counts."""
+        """Errors of the runs and their slopes, bent in a robust fit; zero where a sample does not count."""
         values, slopes = self.physical(point)
         moved = np.array((*point.free, *point.local))
         inputs = self._run_inputs(point, stage, K)
@@ -330,7 +332,7 @@ class GreyBoxProblem:
     def errors_alone(
         self, point: FitPoint, stage: FitStage, K: Float[np.ndarray, "R n C"]
     ) -> Float[np.ndarray, "R N C"]:
-        """The same errors by runs without slopes, which cost less."""
+        """The same errors as `errors`, from runs without slopes, which take less time."""
         values, _ = self.physical(point)
         inputs = self._run_inputs(point, stage, K)
         y_hat = _joined([runs(self.layout, values[rows], *given) for rows, given in inputs])
@@ -339,10 +341,10 @@ class GreyBoxProblem:
 
     @functools.cached_property
     def _calls(self) -> list[tuple[slice, StackedRecordings]]:
-        """Which recordings run in one call of a program, with their samples on the device.
+        """The recordings of each call of a program, with their samples on the device.
 
-        One at a time, so that a program does not depend on how many there are; all at once where devices
-        share them.
+        Each call has one recording, so that a program does not depend on their number. If several devices
+        share the recordings, one call has all of them.
         """
         R = len(self.dataset.recordings)
         calls = [slice(0, R)] if self.layout.mesh else [slice(r, r + 1) for r in range(R)]
@@ -352,7 +354,7 @@ class GreyBoxProblem:
     def _run_inputs(
         self, point: FitPoint, stage: FitStage, K: Float[np.ndarray, "R n C"]
     ) -> list[tuple[slice, tuple[Any, ...]]]:
-        """Recordings that run together; first states, samples, gains and windows as programs take them."""
+        """For each call of a program, its recordings, and their first states, samples, gains and windows."""
         many = point.x0.shape[1] > 1
         x0, window = (point.x0, stage.windows.index) if many else (point.x0[:, 0], None)
         return [
@@ -361,15 +363,16 @@ class GreyBoxProblem:
         ]
 
     def robust(self, end: FitAttempt, beyond: float) -> tuple["GreyBoxProblem", FitAttempt]:
-        """The same problem with large errors bent, and its end.
+        """The same problem with large errors bent (a robust fit), and its end.
 
-        What is large follows from the median of the errors, which large ones do not move, and once more
-        where that fit ends. The fit begins where that by squares has ended, and where that has begun: large
-        errors may have led it elsewhere.
+        The limit for large errors follows from the median of the errors, which large errors hardly change. It
+        is determined again at the end of the first robust fit. This first fit starts at the end and at the
+        start of the fit by squares, which large errors may have led astray.
 
         Args:
-            end: Of a fit by squares.
-            beyond: Errors that are bent, in standard deviations of a normal number with that median.
+            end: End of a fit by squares.
+            beyond: Errors beyond this many standard deviations are bent. The standard deviation is that of a
+                normal distribution with the same median.
         """
         problem, seen = self, self.dataset.data.seen > 0
         starts = [end.point, self.start(end.point.local, end.stage.windows)]
@@ -385,16 +388,20 @@ class GreyBoxProblem:
         return problem, end
 
     def model_at(self, point: FitPoint, recording: int) -> Model:
-        """The model of a recording."""
+        """The model with the values of one recording."""
         return self.model.with_values(self.physical(point)[0][recording])
 
     def horizons(self, seconds: float | None, process_noise: ProcessNoise) -> list[Windows]:
-        """Windows of some seconds, or whole recordings, behind those of shorter horizons for restarts.
+        """Windows of each stage: shorter horizons for restarts first, last the horizon of the fit.
 
-        They have the same number of windows, so that all share one compiled program. Fits of recordings of
-        other lengths share it too, since the number is rounded up: with restarts to the most that they need.
-        A solver of optimistix would compile a program for each; predictions, and fits without restarts, have
-        no use for shorter horizons.
+        All of them are filled up to the same number of windows, so that they share one compiled program. The
+        number is rounded up, with restarts to the largest number that restarts need, so that fits of
+        recordings of other lengths share the program too. There are no shorter horizons for a solver of
+        optimistix, which would compile a program for each, for predictions, and for fits without restarts.
+
+        Args:
+            seconds: Length of the windows of the fit [s]; None for whole recordings.
+            process_noise: Process noise of predictions; None for free runs.
         """
         of_seconds = functools.partial(Windows.of_seconds, self.model, self.dataset)
         lengths = [r.N * r.Ts for r in self.dataset.recordings]
@@ -412,13 +419,13 @@ class GreyBoxProblem:
     def solve(
         self, local: Sequence[int], process_noise: ProcessNoise, window_seconds: float | None
     ) -> FitAttempt:
-        """The best end of the ways that are worth trying."""
+        """The best of all attempts: the first, one from short predictions if it is doubtful, and restarts."""
         *shorter, horizon = self.horizons(window_seconds, process_noise)
         start, last = self.start(local, horizon), FitStage(horizon, process_noise)
         ends = [self.attempt(start, [last])]
         if ends[0].doubtful:
             self.say("fit: again, from short predictions")
-            # Torques as large as those of the motion make the filter follow the data within a few samples.
+            # With process noise this large, the predictor follows the data within a few samples.
             m = self.model.mechanism
             short = process_noise_ports(m, (0.03 * self.dataset.torque_scale) ** 2)
             ends.append(self.attempt(start, [FitStage(horizon, short), last]))
@@ -430,12 +437,12 @@ class GreyBoxProblem:
     def _restarts(
         self, start: FitPoint, ends: Sequence[FitAttempt], way: Sequence[FitStage]
     ) -> list[FitAttempt]:
-        """Further ends: of a restart from the start, then of those around the best end so far.
+        """Ends of restarts: first from the start of the fit, then from random points around the best end.
 
         Args:
-            start: Where the fit has started.
-            ends: Where it has ended.
-            way: Horizons from the shortest to that of the fit, if there are shorter ones.
+            start: Start of the fit.
+            ends: Ends of the attempts so far.
+            way: Stages from the shortest horizon, if there are shorter ones, to the horizon of the fit.
         """
         more, random = list[FitAttempt](), np.random.default_rng(0)
         for number in range(self.restarts):
@@ -453,21 +460,21 @@ class GreyBoxProblem:
         return more
 
     def _settled(self, best: FitAttempt, ends: Sequence[FitAttempt]) -> bool:
-        """Whether the best of some ends explains the data, or so many agree that no other is expected."""
+        """Whether the best of some ends explains the data, or so many agree that no better is expected."""
         here = self.equations(best.point, best.stage, best.K)
         if best.status == "converged" and not misses_something(here.scale, self.dataset.noise):
             return True
         return enough([end.cost for end in ends], here.nats_that_count)
 
     def _moved_by_chance(self, end: FitAttempt, distance: float, random: np.random.Generator) -> FitPoint:
-        """The shared parameters of an end moved by chance, within their physical ranges."""
+        """A point with the common parameters of an end moved at random, within their physical ranges."""
         free, z = list(end.point.free), end.point.z.copy()
         bounded = self._limit(end.point, end.stage.windows)[: len(free)] < np.inf
         z[free] = moved_by_chance(z[free], bounded, distance, random)
         return dataclasses.replace(end.point, z=np.clip(z, *self.ranges))
 
     def at_ends(self, point: FitPoint) -> dict[str, str]:
-        """Parameters at the end of the range of a healthy machine, with a remark."""
+        """Name of each parameter at an end of its physical range -> a remark."""
         names, found = self.model.mechanism.parameter_names, {}
         for i in (*point.free, *point.local):
             z = point.local_z[:, point.local.index(i)] if i in point.local else point.z[i : i + 1]
@@ -477,12 +484,12 @@ class GreyBoxProblem:
         return found
 
     def held_by_ends(self, point: FitPoint, windows: Windows) -> Bool[np.ndarray, " M"]:
-        """Coordinates that are at the end of their range."""
+        """Which coordinates are at an end of their range."""
         room = self._room(point, windows)
         return (room[0] == 0) | (room[1] == 0)
 
     def _follows(self, stage: FitStage) -> bool:
-        """Whether first states are held at what the parameters imply, wholly or in part."""
+        """Whether first states, or some of them, are not fitted but follow from the parameters."""
         unseen = len(rest_state(self.model.mechanism.structure, np.float64)) > self._moving
         return not self.layout.states or (
             unseen and stage.windows.number > 1 and max(stage.windows.counts) > 1
@@ -493,13 +500,13 @@ class GreyBoxProblem:
         return 2 * len(self.model.mechanism.coordinates)
 
     def _at_windows(self, point: FitPoint, windows: Windows) -> FitPoint:
-        """The same parameters, with the first states where fits of these windows start."""
+        """The same parameters, with the first positions and speeds from which fits to these windows start."""
         x0 = point.x0.copy()
         x0[..., : self._moving] = windows.first_states
         return dataclasses.replace(point, x0=x0)
 
     def _with_shown_states(self, point: FitPoint, stage: FitStage) -> FitPoint:
-        """First states that the first samples show, where they are held, and memories of a whole run."""
+        """The point with measured first states, where these are not fitted, and memories from a whole run."""
         if not self._follows(stage):
             return point
         x0 = point.x0.copy()
@@ -525,7 +532,7 @@ class GreyBoxProblem:
         )
 
     def _room(self, point: FitPoint, windows: Windows) -> tuple[np.ndarray, np.ndarray]:
-        """How far each coordinate may go down (not positive) and up (not negative)."""
+        """How far each coordinate may move down (zero or negative) and up (zero or positive)."""
         c = self.coordinates(point, windows)
         room = np.full((2, c.size), np.inf) * np.array([[-1], [1]])
         for own, bound in zip(room, self.ranges, strict=True):
@@ -535,7 +542,7 @@ class GreyBoxProblem:
         return room[0], room[1]
 
     def _limit(self, point: FitPoint, windows: Windows) -> Float[np.ndarray, " M"]:
-        """Largest step of each coordinate: a parameter with a bound by a factor of e."""
+        """Largest step of each coordinate; a parameter with one bound may change by a factor of e."""
         specs = self.model.mechanism.parameter_specifications
         bounded = np.array([bool(np.isfinite(s.lower) or np.isfinite(s.upper)) for s in specs])
         most = np.where(bounded, LARGEST_STEP, np.inf)
@@ -544,7 +551,7 @@ class GreyBoxProblem:
     def _minimum(
         self, point: FitPoint, stage: FitStage, K: Float[np.ndarray, "R n C"], tolerance: float
     ) -> Minimum:
-        """The least cost near a point."""
+        """The minimum of the cost from a point."""
         if self.minimiser is not None:
             from rotflex_jax.fit.optimistix_adapter import minimise_by  # takes long to import
 

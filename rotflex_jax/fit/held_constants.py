@@ -1,4 +1,4 @@
-"""The trusted constants on which the interval of an estimate depends, from the equations of motion alone."""
+"""Trusted constants on which the interval of an estimate depends, from the equations of motion alone."""
 
 import dataclasses
 import math
@@ -14,15 +14,15 @@ from rotflex_jax.mechanism.assembly import second_order_matrices
 from rotflex_jax.mechanism.quantity import Units
 from rotflex_jax.parameters import HALF_WIDTH_95, Estimate, HeldConstant, Specification, specifications
 
-# Constants of a motor or a load are rarely known better than so: tolerances of data sheets are 5 to 12 %.
+# Constants of a motor or a load are rarely known better than this: tolerances in data sheets are 5 to 12 %.
 TOLERANCE = 0.05
 _PERCENT = 0.01
-# Step of a difference quotient relative to a parameter, and what counts as zero beside it.
+# Step of a difference quotient relative to a parameter, and relative size that counts as zero.
 _STEP, _ZERO = 1e-6, 1e-4
 
 
 class _Place(NamedTuple):
-    """A parameter of an effect, and its row among the rows that data determine, if it has one of its own."""
+    """A parameter of an effect, and its own row among the quantities that data determine, or None."""
 
     effect: int
     name: str
@@ -35,18 +35,19 @@ def with_held_constants(mechanism: Mechanism, estimates: Sequence[Estimate]) -> 
 
         G(p + dp, c + dc) = (1 + d dlambda) G(p, c)
 
-    `G` are the entries of the linear equations of motion and the parameters of all other effects, and `d`
-    how often a torque is in the unit of each: all that input and outputs determine, up to one common factor
-    `1 + dlambda` of all torques. A change `dc` of a trusted constant for which free parameters have a `dp`
-    leaves every run as it is, so no recording of these channels shows it. Where `TOLERANCE` of a constant
-    moves an estimate out of its 95 % interval, the constant is named. An armature inductance counts at
-    constant speed; effects with linear states of their own are taken as they are.
+    `G` are the entries of the linear equations of motion and the parameters of all other effects. `d` is the
+    exponent of torque in the unit of each. Input and outputs determine `G` up to one common factor
+    `1 + dlambda` of all torques. If a change `dc` of a trusted constant can be compensated by a change `dp`
+    of free parameters, no run changes, and no recording of these channels shows it. A constant is named if a
+    change by its `TOLERANCE` moves an estimate out of its 95 % interval. A motor with armature inductance has
+    the entries that it has at constant speed. For other effects with linear states of their own, the
+    parameters are in `G`.
 
     A parameter that always equals another one gets the other's value.
 
     Args:
-        mechanism: With the fitted values.
-        estimates: Of its parameters; those that are not free are the trusted ones.
+        mechanism: Mechanism with the fitted values.
+        estimates: Estimates of its parameters; parameters that are not free are trusted.
 
     Returns:
         The estimates in the same order.
@@ -75,7 +76,7 @@ def with_held_constants(mechanism: Mechanism, estimates: Sequence[Estimate]) -> 
 
 
 def _moved(m: Mechanism, free: set[str]) -> dict[str, dict[str, float]]:
-    """Trusted constant -> free parameter -> its change where the constant is one per cent larger."""
+    """Trusted constant -> free parameter -> its change if the constant is one per cent larger."""
     if not np.isfinite(m.values).all():
         return {}
     places: list[_Place] = []
@@ -111,7 +112,7 @@ def _moved(m: Mechanism, free: set[str]) -> dict[str, dict[str, float]]:
     A = np.concatenate([columns[:, moving], scaled], axis=1)
     u, s, vt = np.linalg.svd(A, full_matrices=False)
     kept = s > _ZERO * s[0]
-    # What a direction that changes nothing leaves open has no change of its own.
+    # A parameter in a direction that changes nothing has no definite change.
     unclear = np.linalg.norm(vt[~kept], axis=0) > _ZERO if (~kept).any() else np.zeros(A.shape[1], bool)
     found = {}
     for j, name in enumerate(names):
@@ -120,7 +121,7 @@ def _moved(m: Mechanism, free: set[str]) -> dict[str, dict[str, float]]:
         b = -columns[:, j] * _PERCENT * now[j] / steps[j]
         x = vt[kept].T @ ((u[:, kept].T @ b) / s[kept])
         if np.linalg.norm(A @ x - b) > _ZERO * np.linalg.norm(b):
-            continue  # a run with another value would be another run
+            continue  # no change of free parameters compensates: runs show the constant
         found[name] = {names[i]: float(x[k] * steps[i]) for k, i in enumerate(moving) if not unclear[k]}
     return found
 
@@ -137,14 +138,14 @@ def _slope(
 
 
 def _only_entries(effect: Effect) -> bool:
-    """Whether an effect acts by nothing but its entries in the equations of motion."""
+    """Whether an effect acts only by its entries in the linear equations of motion."""
     if not isinstance(effect, Linear) or hasattr(effect, "force"):
         return False
     return effect.motor or not len(effect.stamp().own)
 
 
 def _entries(m: Mechanism, effects: Sequence[Effect]) -> Float[np.ndarray, " E"]:
-    """Mass, damping, stiffness and drive of the linear effects, one after the other."""
+    """Entries of mass, damping, stiffness and drive from the linear effects, in one array."""
     linear = (e for e in effects if _only_entries(e) and isinstance(e, Linear))
     stamps = [(e.stamp().static(), m.vector(e)) for e in linear]
     return np.concatenate([np.ravel(part) for part in second_order_matrices(stamps, len(m.coordinates))])
@@ -158,5 +159,5 @@ def _kind_sizes(m: Mechanism, entries: Float[np.ndarray, " E"]) -> Float[np.ndar
 
 
 def _degree(spec: Specification) -> float:
-    """How often a torque is in a unit."""
+    """Exponent of torque in a unit."""
     return math.log2(Units(effort_size=2.0).size(spec.unit))

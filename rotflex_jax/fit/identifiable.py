@@ -1,12 +1,12 @@
-"""What a machine and a recording of it can know: structural and practical identifiability.
+"""Structural and practical identifiability of the parameters of a machine.
 
-Structural: which combinations of parameters no recording determines, whatever its length and noise. For a
-linear machine by exact arithmetic (`structural_identifiability.py`), for any other by the rank of the
-sensitivities of free runs at random parameters and inputs. Practical: which combinations one recording
-determines badly, by the eigenvectors of its information about the logarithms of the parameters.
+Structural: which combinations of parameters no recording determines, whatever its length and noise. They are
+computed in exact arithmetic for a linear machine (`structural_identifiability.py`), for any other machine by
+the rank of the sensitivities of free runs at random parameters and inputs. Practical: which combinations one
+recording determines badly, by the eigenvectors of its information about the logarithms of the parameters.
 
-All sensors that a machine might have are outputs of one compiled run, so that what another one would add is
-a matter of rows.
+All sensors that a machine might have are outputs of one compiled run. So the benefit of a further sensor
+follows from further rows.
 """
 
 import dataclasses
@@ -42,35 +42,38 @@ from rotflex_jax.recording.recording import SHORTEST_TO_FIT, single
 from rotflex_jax.text.markup import bullets, card, paragraph
 from rotflex_jax.text.numbers import json_numbers
 
-# Singular values of normalised sensitivities below this are zeros but for rounding.
+# Singular values of normalised sensitivities below this count as zero, apart from rounding.
 ZERO = 1e-7
-# Samples of a random run, and its period where no recording gives one [s].
+# Number of samples and sampling period [s] of a random run, if no recording gives them.
 RANDOM_SAMPLES, RANDOM_PERIOD = 1000, 0.004
-# Random inputs are so large, times 1 V or 0.3 rad; parameters are drawn within this factor.
+# Sizes of random inputs, times 1 V, 0.3 rad or the root mean square of the recording; random parameters lie
+# within exp(+-FACTOR) times their values.
 INPUT_SIZES, FACTOR = (1.0, 3.0, 10.0), 0.5
-# Directions known worse than this share of the values are named [standard deviation].
+# A direction is badly known if its standard deviation exceeds this share of the values.
 BADLY_KNOWN = 0.1
-# A parameter near zero counts as this share of its typical size.
+# A parameter near zero counts as having this share of its typical size.
 SHARE_OF_TYPICAL = 0.1
-# A held parameter, sensor or input is worth naming where it makes the worst direction so many times better.
+# A held parameter, a sensor or an input is worth naming if it improves the worst direction by this factor.
 HELPS = 3.0
 
 
 @dataclasses.dataclass(frozen=True)
 class Identifiability:
-    """What is known of a machine, from any recording and from one.
+    """Identifiability of the parameters of a machine: structural, and by one recording.
 
     Attributes:
-        free: Parameters that a fit would move.
-        rank: How many combinations of them a perfect recording would determine.
-        unknown: The other combinations.
-        trust: Sets of parameters each of which, held, leaves nothing unknown; the smallest sets.
-        sensors: Further sensors -> how many combinations would still be unknown with them; those that help.
-        exact: Whether in exact arithmetic.
-        badly_known: Combinations that this recording determines worse than 10 %.
-        trust_here: Parameter -> worst standard deviation of any combination once it is held; the best first.
-        sensors_here: Further sensor -> the same with it.
-        inputs_here: Another input -> the same with it.
+        free: Free parameters.
+        rank: Number of combinations of them that a perfect recording would determine.
+        unknown: The combinations that it would not determine.
+        trust: The smallest sets of parameters that leave nothing unknown if they are held.
+        sensors: Further sensor -> number of combinations that would still be unknown with it; only sensors
+            that help.
+        exact: Whether the structural part was computed in exact arithmetic.
+        badly_known: Combinations that this recording determines with a standard deviation of more than 10 %;
+            None without a recording.
+        trust_here: Parameter -> largest standard deviation of a combination if it is held; the best first.
+        sensors_here: Further sensor -> largest standard deviation of a combination with this sensor.
+        inputs_here: Another input -> largest standard deviation of a combination with this input.
         std: Parameter -> standard deviation as a share of its value, by this recording.
     """
 
@@ -93,12 +96,12 @@ class Identifiability:
 
     @property
     def practical(self) -> bool | None:
-        """Whether this recording determines all combinations to 10 %; None without a recording."""
+        """Whether this recording determines all combinations within 10 %; None without a recording."""
         return None if self.badly_known is None else not self.badly_known
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """All of it in words."""
+        """All results in words."""
         how = "in exact arithmetic" if self.exact else "by the rank of sensitivities at random numbers"
         said = []
         if self.structural:
@@ -156,7 +159,7 @@ class Identifiability:
         }
 
     def _repr_html_(self) -> str:
-        """What is known in principle, then by the recording."""
+        """A card with structural identifiability first, then identifiability by the recording."""
         first, *others = self.sentences
         return card("What can be known", paragraph(first), bullets(others))
 
@@ -165,18 +168,18 @@ class Identifiability:
 
 
 def _either(sets: Sequence[Sequence[str]]) -> str:
-    """Some sets of names as alternatives, not all of them."""
+    """Sets of names as alternatives in words, at most six of them."""
     shown = [" with ".join(names) for names in sets[:6]]
     return (" or " if len(sets[0]) == 1 else ", or ").join(shown) + (" or others" if len(sets) > 6 else "")
 
 
 @dataclasses.dataclass(frozen=True)
 class Sensors:
-    """Readings that there are, and those that there might be.
+    """Sensors that a machine has, and sensors that it might have.
 
     Attributes:
         here: Rows over positions and speeds of the machine's own channels.
-        further: Name in words -> row of a sensor that it lacks.
+        further: Name in words -> row over positions and speeds of a sensor that the machine lacks.
     """
 
     here: list[tuple[float, ...]]
@@ -184,7 +187,7 @@ class Sensors:
 
     @classmethod
     def of(cls, m: Mechanism) -> "Sensors":
-        """Positions and speeds of all ports that no channel shows."""
+        """The sensors of a machine; further ones measure all positions and speeds of ports that it lacks."""
         ports = m.port_vectors
         pairs = [(port, Quantity(what)) for _, (port, what) in m.outputs]
         here = [q.row(tuple(ports[port])) for port, q in pairs]
@@ -198,7 +201,7 @@ class Sensors:
         return cls(here, {name: row for name, row in wanted.items() if row not in here})
 
     def all_outputs(self, m: Mechanism) -> Mechanism:
-        """The machine with all of them as outputs, its own first."""
+        """The machine with all sensors as outputs, its own first."""
         added = {}
         for name in self.further:
             quantity, _, port = name.removeprefix("the ").partition(" of ")
@@ -207,25 +210,26 @@ class Sensors:
 
 
 def identifiable(mechanism: Mechanism | Model | Fit, recording: Recording | None = None) -> Identifiability:
-    """What this machine, and this recording of it, can know of the free parameters.
+    """Structural and practical identifiability of the free parameters of a machine.
 
         structural: rank of d(outputs) / d ln(parameters)
         practical: H = J'J / noise^2,  std = eig(H)^(-1/2)
 
-    Structural is what no recording of these sensors determines, for instance the common factor of all torques
-    of a machine of which only voltage and angles are known: for a machine of linear effects in exact
-    arithmetic, for any other at three random sets of parameters with random inputs of different sizes.
-    Practical is what this recording determines worse than 10 %, at the parameters that the mechanism has
-    (fit it first), with first states unknown, and with the noise of the sensors; of a fit with its residuals
-    and with the covariance that allows for their correlation. Both say which parameter to trust and which
-    sensor would help, the second also which input.
+    The structural part gives the combinations of parameters that no recording of these sensors determines,
+    for instance the common factor of all torques if only voltage and angles are measured. It is computed in
+    exact arithmetic if all effects are linear, otherwise at three random sets of parameters with random
+    inputs of different sizes. The practical part gives the combinations that this recording determines with a
+    standard deviation of more than 10 %, at the parameters of the mechanism (fit it first), with first states
+    unknown, and with the noise of the sensors. For a fit, residuals replace the noise, and its covariance
+    allows for their correlation. Both parts name parameters to trust and sensors that would help, the
+    practical part also inputs.
 
     Args:
         mechanism: A mechanism, a model or a fit; trusted parameters are known.
-        recording: For the practical part; None for the structural one alone.
+        recording: Recording for the practical part; None for the structural part alone.
 
     Raises:
-        InputError: No free parameter, or a recording without the channels of the model.
+        InputError: If no parameter is free, or if the recording lacks channels of the model.
 
     Source: M. S. Grewal and K. Glover, IEEE Trans. Autom. Control 21, 1976 (linear); J. A. Jacquez and P.
     Greif, Math. Biosci. 77, 1985 (rank of sensitivities); R. N. Gutenkunst et al., PLoS Comput. Biol. 3, 2007
@@ -308,7 +312,7 @@ def _structural_at_random(model: Model, sensors: Sensors, recording: Recording |
     C = len(sensors.here)
 
     def lost(rows: Sequence[int]) -> tuple[np.ndarray, int]:
-        """What the best draw leaves unknown, and which draw that is."""
+        """Directions that the best draw leaves unknown, and the index of this draw."""
         null = [_null_vectors(J[:, rows]) for _, J in draws]
         best = min(range(len(null)), key=lambda k: len(null[k]))
         return null[best], best
@@ -333,7 +337,7 @@ def _structural_at_random(model: Model, sensors: Sensors, recording: Recording |
 
 
 def _null_vectors(J: Float[np.ndarray, "N C K"]) -> Float[np.ndarray, "n K"]:
-    """Directions (rows) that sensitivities map to nothing but rounding."""
+    """Directions (rows) that sensitivities map to zero, apart from rounding."""
     flat = J.reshape(-1, J.shape[-1])
     if not np.isfinite(flat).all():
         return np.eye(J.shape[-1])
@@ -342,12 +346,12 @@ def _null_vectors(J: Float[np.ndarray, "N C K"]) -> Float[np.ndarray, "n K"]:
     scaled = np.where(seen, flat / np.where(seen, size, 1.0), 0.0)
     _, s, V = np.linalg.svd(np.linalg.qr(scaled, mode="r"))
     null = V[s < ZERO * max(float(s[0]), 1e-300)]
-    # Back in shares of the values.
+    # Scaled back to shares of the values.
     return null / np.where(seen, size / size.max(), 1.0)
 
 
 def _nonzero(m: Mechanism) -> np.ndarray:
-    """Values, and a part of the typical size where one is nearly zero."""
+    """Parameter values, with a share of the typical size in the place of values near zero."""
     typical = np.array([s.typical for s in m.parameter_specifications])
     small = np.abs(m.values) < SHARE_OF_TYPICAL * typical
     return np.where(small, SHARE_OF_TYPICAL * typical * np.where(m.values < 0, -1, 1), m.values)
@@ -355,16 +359,16 @@ def _nonzero(m: Mechanism) -> np.ndarray:
 
 @dataclasses.dataclass(frozen=True)
 class Runs:
-    """A free run with all sensors and its slopes.
+    """A free run with all sensors, and its slopes.
 
     Attributes:
-        model: Solver and machine.
-        sensors: Those that are there come first.
-        values: Of all parameters.
+        model: Machine and solver.
+        sensors: Sensors of the machine and further ones.
+        values: Values of all parameters.
         u: Input.
         Ts: Sampling period [s].
         start: First positions and speeds; at rest if None.
-        least_share: Least size in which moves of a parameter are counted, as a share of its typical one.
+        least_share: Least size to which changes of a parameter are related, as a share of its typical size.
     """
 
     model: Model
@@ -376,7 +380,7 @@ class Runs:
     least_share: float = SHARE_OF_TYPICAL
 
     def slopes(self) -> tuple[Float[np.ndarray, "N C"], Float[np.ndarray, "N C D"]]:
-        """Outputs, and slopes by shares of the free parameters, then by first positions and speeds."""
+        """Outputs, and slopes by relative changes of free parameters, then by first positions and speeds."""
         m = self.sensors.all_outputs(self.model.mechanism)
         names, states = m.parameter_names, 2 * len(m.coordinates)
         free = np.array([names.index(n) for n in m.free_names])
@@ -387,7 +391,7 @@ class Runs:
         return free_run_slopes(layout, self.values, shares, free, start, self.u, self.Ts)
 
     def scaled(self) -> Float[np.ndarray, "N C K"]:
-        """Slopes by shares of the parameters, each channel by the size of its own signal."""
+        """Slopes by relative changes of the parameters, each channel divided by the size of its signal."""
         y, J = self.slopes()
         size = np.maximum(np.std(y, axis=0), 1e-12)
         return J[..., : len(self.model.mechanism.free_names)] / size[:, None]
@@ -396,7 +400,7 @@ class Runs:
 def _information(
     J: Float[np.ndarray, "N C D"], noise: Float[np.ndarray, " C"], K: int
 ) -> Float[np.ndarray, "K K"]:
-    """Information about shares of the parameters, with first states unknown."""
+    """Information about relative changes of the parameters, with first states unknown."""
     flat = (J / noise[:, None]).reshape(-1, J.shape[-1])
     H = flat.T @ flat
     if J.shape[-1] == K:
@@ -405,7 +409,7 @@ def _information(
 
 
 def _directions(H: Float[np.ndarray, "K K"]) -> tuple[np.ndarray, np.ndarray]:
-    """Standard deviations, the largest first, and their directions as rows."""
+    """Standard deviations along the eigenvectors of an information, largest first; these vectors as rows."""
     eigenvalues, vectors = np.linalg.eigh((H + H.T) / 2)
     return 1 / np.sqrt(np.maximum(eigenvalues, 1e-300)), vectors.T
 
@@ -426,13 +430,13 @@ def _with_recording(
     noise = prepared.noise
     if fitted is not None:
         noise = np.maximum(noise, [fitted.noise[c] for c in m.channels])
-    # A further sensor is as good, relative to its signal, as the best of those that are there.
+    # A further sensor is assumed as good, relative to its signal, as the best sensor of the machine.
     spread = np.maximum(np.std(y, axis=0), 1e-12)
     relative = float(np.min(noise / spread[:C]))
     every = np.concatenate([noise, relative * spread[C:]])
     H = _information(J[:, :C], noise, K)
     if fitted is not None and np.isfinite(fitted.covariance).all() and fitted.free_names == free:
-        # The same directions with the errors' correlation in time: nats count for less.
+        # The covariance of the fit allows for the correlation of errors in time.
         typical = np.array([s.typical for s in m.parameter_specifications])
         shares = np.maximum(np.abs(m.values), SHARE_OF_TYPICAL * typical)
         shares = shares[[m.parameter_names.index(n) for n in free]]
@@ -446,7 +450,7 @@ def _with_recording(
     trust, further, inputs = {}, {}, {}
     if bad and found.structural:
         base = _information(J[:, :C], noise, K)
-        counts = worst / _directions(base)[0][0]  # what correlated errors make of the same information
+        counts = worst / _directions(base)[0][0]  # factor by which correlated errors widen the intervals
         for k, name in enumerate(free):
             rest = np.delete(np.arange(K), k)
             if len(rest):
@@ -472,7 +476,7 @@ def _with_recording(
 
 
 def _other_inputs(u: Float[np.ndarray, "N *c"], Ts: float) -> dict[str, Float[np.ndarray, "N *c"]]:
-    """Inputs of the same length that may show more, by what one would say of them; signals stay."""
+    """Name in words -> another input of the same length that may show more; further signals stay the same."""
     whole, u = u, u if u.ndim == 1 else u[:, 0]
     N, most = len(u), max(float(np.abs(u).max()), 1e-12)
     rms = max(float(np.sqrt(np.mean(u**2))), 1e-12)

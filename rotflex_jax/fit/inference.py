@@ -13,10 +13,10 @@ UNDETERMINED_CURVATURE = 1e-11
 
 
 def correlation_length(e: Float[np.ndarray, "N C"]) -> int:
-    """Samples after which the autocorrelation of residuals stays small; at most N / 10, and 1 at least."""
+    """Number of samples after which the autocorrelation of residuals stays small; from 1 to N / 10."""
     N = len(e)
     if N < 20:
-        return 1  # a tenth of so few is no more
+        return 1  # N / 10 is less than 2
     longest = 1
     for column in (e - e.mean(axis=0)).T:
         spectrum = np.abs(np.fft.rfft(column, 2 * N)) ** 2
@@ -24,7 +24,7 @@ def correlation_length(e: Float[np.ndarray, "N C"]) -> int:
         if r[0] <= 0:
             continue
         large = np.flatnonzero(np.abs(r / r[0]) > max(0.05, 2 / np.sqrt(N)))
-        # Beyond the first gap of small values lies noise of the estimate itself.
+        # Large values after the first gap are noise of the estimated autocorrelation.
         gaps = np.flatnonzero(np.diff(large) > 1)
         last = large[gaps[0]] if len(gaps) else large[-1]
         longest = max(longest, int(last) + 1)
@@ -32,14 +32,14 @@ def correlation_length(e: Float[np.ndarray, "N C"]) -> int:
 
 
 def bandwidth(e: Float[np.ndarray, "N C"]) -> int:
-    """Lags that a sandwich sums over: as far as residuals are visibly correlated, and sqrt(N)."""
+    """Number of lags in the sum of a sandwich: as far as residuals are visibly correlated, or sqrt(N)."""
     N = len(e)
-    # A weak correlation that lasts is not visible in any one lag, but its sum counts.
+    # A weak but long correlation is not visible in single lags, but its sum matters.
     return max(correlation_length(e), min(round(np.sqrt(N)), N // 10), 1)
 
 
 class RecordingSlopes(NamedTuple):
-    """Of one recording: slopes of its scaled residuals by d of the parameters, the residuals, and which d."""
+    """Scaled residuals of one recording, their slopes by d of the coordinates, and the columns of these."""
 
     J: Float[np.ndarray, "N C d"]
     e: Float[np.ndarray, "N C"]
@@ -49,19 +49,19 @@ class RecordingSlopes(NamedTuple):
 def by_recording(
     J: Float[np.ndarray, "N C D"], e: Float[np.ndarray, "N C"], segments: Real[np.ndarray, " N"]
 ) -> list[RecordingSlopes]:
-    """Slopes and residuals recording by recording, where every recording depends on every parameter.
+    """Slopes and residuals of each recording, if every recording depends on every parameter.
 
     Args:
         J: Derivative of the scaled residuals.
         e: Scaled residuals.
-        segments: Number of the recording each sample belongs to.
+        segments: Number of the recording to which each sample belongs.
     """
     every = np.arange(J.shape[2])
     return [RecordingSlopes(J[segments == s], e[segments == s], every) for s in np.unique(segments)]
 
 
 def curvature(parts: Sequence[RecordingSlopes], size: int) -> Float[np.ndarray, "D D"]:
-    """Sum of J'J over all samples, by `size` parameters; nan where a slope is not finite."""
+    """Sum of J'J over all samples, for `size` coordinates; nan if a slope is not finite."""
     if not all(np.isfinite(part.J).all() for part in parts):
         return np.full((size, size), np.nan)
     H = np.zeros((size, size))
@@ -72,7 +72,7 @@ def curvature(parts: Sequence[RecordingSlopes], size: int) -> Float[np.ndarray, 
 
 
 def long_run_scores(parts: Sequence[RecordingSlopes], size: int) -> Float[np.ndarray, "D D"]:
-    """Covariance of the sum of `J_k' e_k`, of errors that go on from sample to sample (Bartlett kernel)."""
+    """Covariance of the sum of `J_k' e_k` for errors that are correlated in time (Bartlett kernel)."""
     S = np.zeros((size, size))
     for J, e, columns in parts:
         scores = np.einsum("nc,ncd->nd", e, J)
@@ -86,15 +86,15 @@ def long_run_scores(parts: Sequence[RecordingSlopes], size: int) -> Float[np.nda
 
 
 def nats_that_count(parts: Sequence[RecordingSlopes], H: Float[np.ndarray, "D D"]) -> float:
-    """Nats of a likelihood that say as much as one would if the errors were white; 1 at least.
+    """Number of nats of a likelihood that count as one nat with white errors; at least 1.
 
         trace(H^-1 S) / D
 
-    Errors of a model that lacks something go on for many samples, so that the same information counts many
-    times over.
+    Errors of an incomplete model are correlated over many samples, so that the likelihood counts the same
+    information many times.
 
     Args:
-        parts: The recordings, scaled by the size of their errors.
+        parts: Residuals and slopes of the recordings, scaled by the size of the errors.
         H: Their `curvature`.
     """
     if not np.isfinite(H).all():
@@ -107,7 +107,7 @@ def nats_that_count(parts: Sequence[RecordingSlopes], H: Float[np.ndarray, "D D"
 def scaled_inverse(
     H: Float[np.ndarray, "D D"],
 ) -> tuple[Float[np.ndarray, "D D"], Float[np.ndarray, " D"]]:
-    """Inverse of a curvature in units of the sizes of its coordinates, and these; zero where undetermined."""
+    """Inverse of a curvature scaled to a unit diagonal, and the scales; zero in undetermined directions."""
     size = np.sqrt(np.maximum(np.diag(H), 1e-300))
     return np.linalg.pinv(H / np.outer(size, size), rcond=UNDETERMINED_CURVATURE, hermitian=True), size
 
@@ -117,18 +117,18 @@ def sandwich(parts: Sequence[RecordingSlopes], H: Float[np.ndarray, "D D"]) -> F
 
         H^-1 S H^-1,  H = sum J_k' J_k,  S = sum over lags of Bartlett-weighted products of J_k' e_k
 
-    The iid formula sigma^2 H^-1 makes intervals many times too narrow where the model is incomplete.
-    Where it is complete, the sum over lags scatters, and those parameters whose interval it happens to
-    make narrow miss the truth too often: no combination has less variance than with white residuals.
+    The formula for white residuals, sigma^2 H^-1, gives intervals that are many times too narrow if the model
+    is incomplete. If it is complete, the sum over lags scatters. Where it happens to be small, intervals
+    would miss the true value too often. So no combination gets less variance than with white residuals.
 
     Args:
-        parts: The recordings; products do not cross them. Memory and time are those of the slopes by what
-            each recording depends on: first states, which are a recording's own, cost nothing in others.
+        parts: Residuals and slopes of the recordings; products do not cross recordings. Each part has only
+            the slopes by coordinates on which it depends, so first states of other recordings take no memory
+            or time.
         H: Their `curvature`.
 
     Returns:
-        Covariance; nan where the residuals are not finite, and for parameters that the data do not
-        determine.
+        Covariance; nan if the residuals are not finite, and for parameters that the data do not determine.
 
     Source: Newey and West 1987, Econometrica 55; the larger of two variances: Angrist and Pischke,
     Mostly Harmless Econometrics, 2009, section 8.1.
@@ -141,8 +141,8 @@ def sandwich(parts: Sequence[RecordingSlopes], H: Float[np.ndarray, "D D"]) -> F
     for J, _, columns in parts:
         own = np.ix_(columns, columns)
         white[own] += J.reshape(-1, len(columns)).T @ (residual_covariance @ J).reshape(-1, len(columns))
-    # In units in which each parameter alone is as well determined as any other, an eigenvalue at the
-    # level of rounding is a direction that the data do not determine: no interval, rather than a narrow one.
+    # Scaled to a unit diagonal, an eigenvalue at the level of rounding belongs to a direction that the data
+    # do not determine. Its parameters get no interval instead of a narrow one.
     scale = np.sqrt(np.maximum(np.diag(H), 1e-300))
     eigenvalues, vectors = np.linalg.eigh(H / np.outer(scale, scale))
     undetermined = eigenvalues < UNDETERMINED_CURVATURE
@@ -155,9 +155,9 @@ def sandwich(parts: Sequence[RecordingSlopes], H: Float[np.ndarray, "D D"]) -> F
 
 
 def _larger(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """The smallest covariance of `a` or more that is `b` or more in every direction that `b` determines.
+    """The smallest covariance that is at least `a` and `b` in every direction that `b` determines.
 
-    It does not matter in which combinations of the parameters the two are written.
+    The result does not depend on the coordinates in which the two are written.
     """
     size = np.sqrt(np.maximum(np.diag(b), 1e-300))
     d, u = np.linalg.eigh(b / np.outer(size, size))
@@ -169,7 +169,7 @@ def _larger(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 class Combination(NamedTuple):
-    """A parameter to first order as a weighted sum of fitted coordinates: their rows, and its derivatives."""
+    """A parameter as a weighted sum of fitted coordinates, to first order: rows of these, and derivatives."""
 
     rows: Sequence[int]
     weights: Float[np.ndarray, " k"]
@@ -199,10 +199,11 @@ def estimates(
     Args:
         names: Full names.
         values: Estimated values [declared units].
-        specifications: What is declared of each parameter.
-        combinations: Of the fitted coordinates; None for a parameter that was held.
-        covariance: Of the fitted coordinates; nan where the data do not determine them.
-        notes: A remark on each; none if None.
+        specifications: Declared specification of each parameter.
+        combinations: Each parameter as a combination of fitted coordinates; None for a parameter that was
+            held.
+        covariance: Covariance of the fitted coordinates; nan where the data do not determine them.
+        notes: A note on each parameter; none if None.
     """
     found = []
     for name, value, spec, combination, note in zip(

@@ -1,4 +1,4 @@
-"""Linear least squares from a triangular factor, and the rows it is fitted to."""
+"""Linear least squares from a triangular factor, and the rows of a regression."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -14,7 +14,7 @@ from rotflex_jax.recording import Recording
 from rotflex_jax.recording.recording import listed
 from rotflex_jax.recording.samples import of_one_period
 
-# Singular values below this share of the largest one are rounding: the columns depend on each other.
+# Singular values below this share of the largest one are rounding errors: columns are linearly dependent.
 DEPENDENT_COLUMN_SHARE = 1e-12
 ROWS_PER_FACTOR = 8192  # rows that are factored at once
 
@@ -25,10 +25,10 @@ class Solution:
 
     Attributes:
         w: Weights (P,).
-        basis: Directions (P, r) in which least squares determines them; `w` lies in their span.
-        shrink: Factor of each direction that a ridge leaves of the least-squares solution (r,).
-        rank: Number of directions, r.
-        condition: Largest over smallest eigenvalue of `phi' phi` within them.
+        basis: Directions (P, r) in which least squares determines the weights; `w` lies in their span.
+        shrink: Factor by which a ridge multiplies the least-squares solution along each direction (r,).
+        rank: Number r of directions.
+        condition: Largest over smallest eigenvalue of `phi' phi` within these directions.
     """
 
     w: Float[np.ndarray, " P"]
@@ -39,7 +39,7 @@ class Solution:
 
 
 def factor(A: Float[np.ndarray, "N K"]) -> Float[np.ndarray, "K K"]:
-    """R of the QR decomposition `A = Q R`, in pieces, so that Q is never held.
+    """R of the QR decomposition `A = Q R`, computed by blocks of rows without storing Q.
 
     Source: Golub, Plemmons and Sameh 1988 (QR of a tall matrix by blocks of rows).
     """
@@ -55,12 +55,13 @@ def solve(R: Float[np.ndarray, "K columns"], ridge: float = 0.0) -> Solution:
 
         minimise |y - phi w|^2 + ridge |w|^2
 
-    Without a ridge, columns that depend on each other share the weight (minimum norm); columns that are
-    equal get equal weights.
+    Without a ridge, linearly dependent columns share the weight (minimum norm); equal columns get equal
+    weights.
     """
     A, z = R[:, :-1], R[:, -1]
     size = np.linalg.norm(A, axis=0)
-    # A ridge weighs the weights as they are; without it, columns of one size tell rank from scale.
+    # A ridge penalises unscaled weights. Without a ridge, columns are scaled so that the rank does not depend
+    # on their sizes.
     unit = np.where(size > 0, size, 1.0) if ridge == 0 else np.ones_like(size)
     U, s, Vt = np.linalg.svd(A / unit, full_matrices=False)
     kept = s > DEPENDENT_COLUMN_SHARE * max(s[0], 1e-300)
@@ -74,7 +75,7 @@ def solve(R: Float[np.ndarray, "K columns"], ridge: float = 0.0) -> Solution:
 
 
 def squared_error(R: Float[np.ndarray, "K columns"], w: Float[np.ndarray, " P"]) -> float:
-    """|y - phi w|^2 of the rows behind a triangular factor."""
+    """|y - phi w|^2 for the rows of which a triangular factor is given."""
     return float(np.sum((R[:, -1] - R[:, :-1] @ w) ** 2))
 
 
@@ -85,10 +86,10 @@ def cross_validated_ridge(
 
     Args:
         parts: Triangular factor of each block.
-        count: Ridges to try, from rounding to the mean eigenvalue.
+        count: Number of ridges to try, from the level of rounding to the mean eigenvalue.
 
     Returns:
-        The ridge, and all ridges.
+        The best ridge, and all ridges that were tried.
     """
     P = parts[0].shape[1] - 1
     power = sum(np.sum(R[:, :-1] ** 2) for R in parts) / P
@@ -96,7 +97,7 @@ def cross_validated_ridge(
     errors = np.zeros(count)
     for k, held in enumerate(parts):
         R = factor(np.concatenate([p for j, p in enumerate(parts) if j != k]))
-        # One decomposition serves all ridges, as columns of weights.
+        # One decomposition gives the weights of all ridges, as columns.
         U, s, Vt = np.linalg.svd(R[:, :-1], full_matrices=False)
         filtered = s[:, None] / (s[:, None] ** 2 + ridges) * (U.T @ R[:, -1])[:, None]
         errors += np.sum((held[:, -1:] - held[:, :-1] @ (Vt.T @ filtered)) ** 2, axis=0)
@@ -121,12 +122,12 @@ class RegressionRows:
     def of(
         cls, basis: Basis, recordings: Sequence[Recording], channel: str, skip: int | None
     ) -> "RegressionRows":
-        """Rows of all recordings but their first samples.
+        """Rows of all recordings without their first samples.
 
         Args:
-            basis: Applied to each recording from its start.
-            recordings: At least one.
-            channel: Output.
+            basis: Basis, which is applied to each recording from its start.
+            recordings: At least one recording.
+            channel: Output channel.
             skip: Samples at the start of each recording to leave out; its `n_init` if None.
         """
         require_basis(basis)
@@ -143,9 +144,9 @@ class RegressionRows:
         return cls(*(np.concatenate(part) for part in zip(*parts, strict=True)))
 
     def blocks(self, count: int) -> Int[np.ndarray, " N"]:
-        """Number of the contiguous block each row belongs to; no block crosses recordings.
+        """Number of the contiguous block to which each row belongs; no block crosses recordings.
 
-        Neighbouring samples are correlated, so that shuffled ones would not be independent.
+        Blocks are contiguous because neighbouring samples are correlated: shuffled ones are not independent.
         """
         N = len(self.y)
         found, first = np.zeros(N, int), 0
@@ -160,10 +161,11 @@ class RegressionRows:
 def checked_recordings(
     recordings: Recording | Sequence[Recording], channel: str | None
 ) -> tuple[list[Recording], str]:
-    """A list of recordings of one sampling period, and the channel.
+    """A list of recordings with one sampling period, and the channel.
 
     Raises:
-        InputError: None, different periods, or several channels and no choice.
+        InputError: If there is no recording, if sampling periods differ, or if no channel is named and there
+            are several.
     """
     found = list(listed(recordings))
     periods = sorted({r.Ts for r in found})

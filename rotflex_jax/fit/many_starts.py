@@ -1,4 +1,4 @@
-"""The same fit from many starts: which parameters are the answer, and not a local minimum."""
+"""Fits from many starts, which show whether parameters are the global minimum or a local one."""
 
 import dataclasses
 import functools
@@ -45,15 +45,15 @@ from rotflex_jax.runtime.xla import double_precision, mesh_of, one_thread, sprea
 CONVERGED_SHARE = 1e-9
 """A step that would lower the cost by less than this share of it is not taken."""
 RANKING_SHARE = 1e-3
-"""The same where starts are only put in order."""
+"""This share of the cost in the first stage, where starts are only ranked."""
 
 
 class SharedInputs(NamedTuple):
-    """What all starts have in common.
+    """Inputs that all starts have in common.
 
     Attributes:
-        values: Of all parameters; those that are not free stay.
-        free: Indices of the free ones.
+        values: Values of all parameters; parameters that are not free keep them.
+        free: Indices of the free parameters.
         data: The recordings.
         scale: Size of the error of each channel.
     """
@@ -65,10 +65,10 @@ class SharedInputs(NamedTuple):
 
 
 class JointEquations(NamedTuple):
-    """Normal equations of R recordings by K common coordinates and the first state (m,) of each.
+    """Normal equations of R recordings, in K common coordinates and the first state (m,) of each recording.
 
-    A point and a step are a pair, the common coordinates (K,) and the first states (R, m). A first state is
-    eliminated from the step, for it meets only the samples of its own recording.
+    A point or a step is a pair of the common coordinates (K,) and the first states (R, m). First states are
+    eliminated from the step, since each affects only the samples of its own recording.
     """
 
     recordings: NormalEquations
@@ -81,15 +81,15 @@ class JointEquations(NamedTuple):
     def step(
         self, damping: Float[Array, ""], limit: Float[Array, " K"]
     ) -> tuple[tuple[Float[Array, " K"], Float[Array, "R m"]], Bool[Array, ""]]:
-        """Damped step, that of the common coordinates within their limits, and whether these hold it short.
+        """Damped step, with common coordinates within their limits, and whether a limit shortens it.
 
-        Far from the answer the linear picture is wrong about where it ends, and without a limit two starts
-        in three from a wide box end elsewhere than at the least cost.
+        Far from the minimum the linear model is wrong about where the minimum is. Without a limit, two of
+        three starts from a wide box do not end at the least cost.
         """
         K, (_, g, H) = len(limit), self.recordings
         common, mixed = damped(jnp.sum(H[:, :K, :K], axis=0), damping), H[:, :K, K:]
         own = damped(H[:, K:, K:], damping)
-        # What the first states would do by themselves, and what they do with the parameters.
+        # Response of the first states to the parameters, and their own step.
         inner = jnp.linalg.solve(own, jnp.concatenate([jnp.swapaxes(mixed, 1, 2), g[:, K:, None]], axis=2))
         left = common - jnp.sum(jnp.einsum("rkm,rml->rkl", mixed, inner[:, :, :K]), axis=0)
         right = jnp.sum(g[:, :K] - jnp.einsum("rkm,rm->rk", mixed, inner[:, :, K]), axis=0)
@@ -97,21 +97,21 @@ class JointEquations(NamedTuple):
         return (dz, -inner[:, :, K] - jnp.einsum("rmk,k->rm", inner[:, :, :K], dz)), limited
 
     def predicted_decrease(self, step: tuple[Float[Array, " K"], Float[Array, "R m"]]) -> Float[Array, ""]:
-        """By how much the quadratic model falls along a step."""
+        """Decrease of the quadratic model along a step."""
         dz, dx0 = step
         each = jnp.concatenate([jnp.broadcast_to(dz, (len(dx0), len(dz))), dx0], axis=1)
         return jnp.sum(self.recordings.predicted_decrease(each))
 
 
 class StartResults(NamedTuple):
-    """Where starts ended.
+    """Results of the fits from several starts.
 
     Attributes:
-        values: Of all parameters.
-        x0: First states.
-        cost: Half the sum of squared errors.
-        steps: Runs that it took.
-        z: Unconstrained coordinates of the free parameters.
+        values: Values of all parameters at the end of each fit.
+        x0: First states there.
+        cost: Half the sum of squared scaled errors there.
+        steps: Number of evaluations of each fit.
+        z: Unconstrained coordinates of the free parameters at the end of each fit.
     """
 
     values: Float[Any, "S P"]
@@ -132,19 +132,19 @@ def minimise_starts(
     max_steps: int,
     tolerance: float = CONVERGED_SHARE,
 ) -> StartResults:
-    """Where every start leads, on each device one after the other.
+    """Fits from all starts, one after the other on each device.
 
-    Side by side they would wait for the slowest, and a run with all its sums fills a core as it is.
+    In a batch, all would wait for the slowest one, and a single run already uses a core fully.
 
     Args:
         structure: Mechanism without values; static.
         solver: Integration rule; static.
-        mesh: Devices that the starts are shared out to; None for one device; static.
+        mesh: Devices among which the starts are divided; None for one device; static.
         z: Unconstrained coordinates of the free parameters at each start.
         x0: First positions and speeds at each start.
-        inputs: What they have in common.
-        max_steps: Most runs of each.
-        tolerance: Share of the cost below which there is nothing more to gain.
+        inputs: Inputs that all starts have in common.
+        max_steps: Largest number of evaluations of each fit.
+        tolerance: A fit ends if a step would lower the cost by less than this share of it.
     """
     each = functools.partial(_minimise_each, structure, solver)
     return spread(each, mesh)((z, x0), inputs, max_steps, tolerance)
@@ -190,22 +190,22 @@ def _minimise_each(
 
 
 STARTS_PER_CALL = 8
-"""Starts of a device in one compiled call; progress is told between calls."""
+"""Starts of a device in one compiled call; progress is reported between calls."""
 SAME_MINIMUM_SHARE = 1e-3
 """Costs that differ by less than this share belong to one local minimum."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ManyStarts:
-    """Where many starts ended.
+    """Results of the fits from many starts.
 
     Attributes:
-        model: With the parameters of the least cost.
-        cost: Half the sum of squared errors there, in units of the sensor's noise.
-        costs: Of all that went to the end, the least first.
-        values: Parameter values of these.
-        steps: Runs that each of them took on the whole recordings.
-        starts: How many there were.
+        model: The model with the parameters of the least cost.
+        cost: Least cost: half the sum of squared errors, in units of the sensor noise.
+        costs: Costs of all starts that were fitted to the whole recordings, the least first.
+        values: Parameter values of these starts.
+        steps: Number of evaluations of each of these starts on the whole recordings.
+        starts: Number of all starts.
     """
 
     model: Model
@@ -217,7 +217,7 @@ class ManyStarts:
 
     @property
     def share(self) -> float:
-        """Share of those that went to the end that ended at the least cost."""
+        """Share of the starts fitted to the whole recordings that reached the least cost."""
         return float(np.mean(self.costs <= self.cost * (1 + SAME_MINIMUM_SHARE)))
 
     def __str__(self) -> str:
@@ -251,35 +251,37 @@ def many_starts(
 
         minimise  sum_k |(y_k - y_hat_k) / s|^2   over free parameters and first states, y_hat a free run
 
-    All starts are fitted to the first seconds of the recordings, which is cheap and has fewer local minima,
-    and only the best of them to the whole. A step changes no bounded parameter by more than a factor of e.
-    Recordings are fitted jointly: parameters are common, first states each recording's own.
+    All starts are fitted to the first seconds of the recordings, which takes little time and has fewer local
+    minima. Only the best of them are fitted to the whole recordings. A step changes no parameter with one
+    bound by more than a factor of e. Recordings are fitted jointly: parameters are common, and each recording
+    has its own first state.
 
-    It gives estimates, not intervals: hand the `model` to `fit` for those. Not for a model that is known to
-    miss something large: a long free run then has its least cost at wrong parameters, and `fit` with
-    `process_noise` does better. Memory is that of the recordings, whatever the starts.
+    The result has estimates without intervals: give its `model` to `fit` for intervals. Do not use it for a
+    model that is known to lack something large: a long free run then has its least cost at wrong parameters,
+    and `fit` with `process_noise` is better. The memory needed does not depend on the number of starts.
 
     Args:
-        mechanism: What to fit; its values are the first start and the middle of the others, its trusted
-            parameters are held.
-        recordings: One or several.
-        starts: How many.
-        spread: Each parameter starts within this share of its size, above or below, between 0 and 1; one
-            that may be negative within this share of its typical size.
-        short_seconds: First part of each recording that all starts are fitted to [s]; None for all of it.
-        keep: How many of the best go on to the whole.
-        max_steps: Most runs of one start in each stage.
-        seed: Of the starts.
-        devices: Those of this process that the starts are shared out to; all of them if None, unless
+        mechanism: Mechanism to fit. Its values are the first start and the centre of the others, and its
+            trusted parameters are held.
+        recordings: One or several recordings.
+        starts: Number of starts.
+        spread: Share of its size, between 0 and 1, within which a parameter starts above or below its value;
+            for a parameter without a lower bound, or at zero, share of its typical size.
+        short_seconds: Length of the first part of each recording to which all starts are fitted [s]; None for
+            all of it.
+        keep: Number of the best starts that are fitted to the whole recordings.
+        max_steps: Largest number of evaluations of one start in each stage.
+        seed: Seed of the random starts.
+        devices: Devices of this process among which the starts are divided; all of them if None, unless
             `jax.default_device` names one.
         progress: Called with a line of text now and then.
 
     Returns:
-        The best, and where the others ended.
+        The best fit, and the results of the other starts.
 
     Raises:
-        InputError: Nothing to fit, arguments out of their range, a channel that moves against the model, or
-            no start with a finite error.
+        InputError: If there is nothing to fit, if arguments are out of their range, if a channel moves
+            against the model, or if no start has a finite error.
     """
     model, say = Model.of(mechanism), checks.progress(progress)
     given = list(listed(recordings, shortest=SHORTEST_TO_FIT))
@@ -334,7 +336,7 @@ def _box(m: Mechanism, free: np.ndarray, starts: int, spread: float, seed: int) 
 
 
 def _first_parts(recordings: list[Recording], seconds: float | None) -> list[Recording] | None:
-    """Their first seconds; None where these are hardly shorter than the whole."""
+    """The first seconds of recordings; None if these are more than half of the whole."""
     if seconds is None:
         return None
     lengths = [max(round(min(seconds / r.Ts, r.N)), 2 * r.n_init) for r in recordings]
@@ -357,9 +359,10 @@ def _stage(
     mesh: Mesh | None,
     say: Callable[[str], None],
 ) -> StartResults:
-    """All starts on some recordings; what is not finite costs infinitely much."""
+    """Fits from all starts to some recordings; a cost that is not finite becomes infinite."""
     parts, mesh = [], mesh if len(z) > 1 else None
-    # As many for each device, so that none waits for another: some take sixty runs where others take three.
+    # The same number of starts for each device, which fits them one after the other: some fits take sixty
+    # evaluations, others three.
     size = mesh.size if mesh else 1
     together = size * min(STARTS_PER_CALL, -(-len(z) // size))
     with double_precision():

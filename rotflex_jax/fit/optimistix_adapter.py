@@ -1,10 +1,10 @@
-"""A fit by a solver of optimistix: the sums of its runs as a least-squares problem of a few residuals.
+"""A fit by a solver of optimistix, to which the sums of the runs appear as a small least-squares problem.
 
     r = (a, sqrt(2 cost - a'a)),   J = (L', 0),   with H = L L', L a = g
 
-has the cost `r'r / 2`, the slope `J'r = g` and the product `J'J = H` of the whole problem, so a solver of the
-Gauss-Newton kind takes the same steps as on the residuals of all samples, of which it sees none. The scale
-of the channels is held while it works, and the whole repeated with new ones until these converge.
+has the cost `r'r / 2`, the gradient `J'r = g` and the product `J'J = H` of the whole problem. So a solver of
+the Gauss-Newton kind takes the same steps as with the residuals of all samples, which it does not get. The
+scales of the channels are held during a minimisation, which is repeated with new scales until these converge.
 """
 
 import functools
@@ -27,17 +27,17 @@ if TYPE_CHECKING:
 
 Minimiser = optx.AbstractLeastSquaresSolver
 
-# Minimisations at most; they end where no scale changes by more than this share.
+# Largest number of minimisations; they end when no scale changes by more than this share.
 MAX_RESCALINGS, SCALE_TOLERANCE = 8, 1e-3
 
 
 class Moves(NamedTuple):
-    """What a step changes: columns of the coordinates in the parameters, and of the first states.
+    """Columns of a step that change parameters and first states.
 
     Attributes:
-        free: Parameters, those that all recordings share first.
-        parameters: Their columns in each recording.
-        states: Columns of each window's first state.
+        free: Indices of the fitted parameters, common ones first, then local ones.
+        parameters: Their columns, for each recording.
+        states: Columns of the first state of each window, for each recording.
     """
 
     free: tuple[int, ...]
@@ -46,7 +46,7 @@ class Moves(NamedTuple):
 
     @classmethod
     def of(cls, point: "FitPoint", c: FitCoordinates) -> "Moves":
-        """Those of a point."""
+        """The columns for a point."""
         shared = tuple(range(c.shared))
         recordings = range(len(point.local_z))
         return cls(
@@ -65,17 +65,17 @@ def minimise_by(
     stage: "FitStage",
     K: Float[np.ndarray, "R n C"],
 ) -> Minimum:
-    """Where the solver ends, in float64; takes the place of `optimise.damped_least_squares.minimise`.
+    """Minimum by a solver of optimistix, in float64; replaces `optimise.damped_least_squares.minimise`.
 
-    Bounds on the physical range, which are no part of the coordinates, are not known to it. Not with a solver
-    that looks at single residuals: these are no errors of samples.
+    The solver does not know the ends of physical ranges, which are not part of the coordinates. Do not use a
+    solver that evaluates single residuals: here they are not errors of samples.
 
     Args:
         minimiser: Solver of optimistix, such as `LevenbergMarquardt(rtol=1e-6, atol=1e-6)`.
-        problem: What it fits.
+        problem: The problem of the fit.
         point: The start.
         stage: Free runs or predictions.
-        K: Gains.
+        K: Gains of the predictor.
     """
     coordinates, here = problem.coordinates(point, stage.windows), problem.equations(point, stage, K)
     first, steps, status = here, 0, Status.UNSOLVED
@@ -130,7 +130,7 @@ def _slopes(which: Any, at: Any, way: Any) -> tuple[Array, Array]:
 def _compressed(which: Any, step: Float[Array, " M"], fixed: Any) -> tuple[Array, Array]:
     """`r`, and the rows of `J` that are not zero."""
     cost, g, H = _sums(which, step, fixed)
-    # Scaled to a unit diagonal first: coordinates may differ by many orders of size.
+    # Scaled to a unit diagonal first, since coordinates may differ by many orders of magnitude.
     diagonal = jnp.diagonal(H)
     size = jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1.0))
     L = jnp.linalg.cholesky(H / jnp.outer(size, size) + 1e-14 * len(g) * jnp.eye(len(g), dtype=g.dtype))
@@ -142,7 +142,7 @@ def _compressed(which: Any, step: Float[Array, " M"], fixed: Any) -> tuple[Array
 def _sums(
     which: tuple[RunLayout, tuple[Specification, ...], Moves], step: Float[Array, " M"], fixed: Any
 ) -> tuple[Float[Array, ""], Float[Array, " M"], Float[Array, "M M"]]:
-    """Half the squared scaled errors, their gradient, and `J'J`, after a step."""
+    """Half the sum of squared scaled errors after a step, its gradient, and `J'J`."""
     layout, specs, moves = which
     z, local_z, x0, given, window, K, scale = fixed
     (data, constants), free = given, np.array(moves.free)

@@ -1,4 +1,4 @@
-"""What is physically plausible: ranges of parameters, signs of channels, sizes the recordings speak for."""
+"""Physical plausibility: ranges of parameters, signs of channels, sizes that the recordings reach."""
 
 import itertools
 import math
@@ -51,12 +51,13 @@ _DAMPING = "N m s/rad"
 def physical_ranges(m: Mechanism) -> tuple[Float[np.ndarray, " P"], Float[np.ndarray, " P"]]:
     """Least and largest unconstrained value of each parameter.
 
-    They are the physical ranges that effects declare. A damping coefficient may fall below its own range as
-    far as others damp the same port: then it corrects them, as with a back-EMF constant that is trusted and
-    too large, and what stays is the damping of a machine. A start outside widens the range.
+    They are the physical ranges that effects declare. A damping coefficient may fall below its own range by
+    the damping of other effects at the same port. Then it corrects them, for instance a trusted back-EMF
+    constant that is too large, and the total damping remains physical. If a start is outside of a range, the
+    range is widened.
 
     Args:
-        m: With the values at the start.
+        m: Mechanism with the values at the start.
     """
     low, high = [], []
     for effect in m.effects:
@@ -67,8 +68,8 @@ def physical_ranges(m: Mechanism) -> tuple[Float[np.ndarray, " P"], Float[np.nda
             high.append(spec.physical[1])
     values, transform = m.values, Transform.of(m.parameter_specifications)
     low, high = np.minimum(low, values), np.maximum(high, values)
-    # An end beyond a declared bound is never reached. A coordinate runs with its parameter but where that
-    # has only an upper bound, and no effect declares such a one.
+    # An end beyond a declared bound is never reached. A coordinate increases with its parameter unless the
+    # parameter has only an upper bound, which no effect declares.
     ends = (low > transform.lower, low, -np.inf), (high < transform.upper, high, np.inf)
     lowest, highest = (
         np.where(inside, transform.unconstrain(np.where(inside, end, values)), none)
@@ -77,28 +78,29 @@ def physical_ranges(m: Mechanism) -> tuple[Float[np.ndarray, " P"], Float[np.nda
     return lowest, highest
 
 
-# Moves over each of these shares of the recording, of at most so many samples, are compared.
+# Changes over each of these shares of a recording are compared; largest number of samples of it that are
+# used.
 MOVE_SHARES, MAX_SIGN_SAMPLES = (0.001, 0.003, 0.01, 0.03), 20_000
-# Samples of a block of the linear run.
+# Number of samples in a block of the linear run.
 LINEAR_RUN_BLOCK = 64
-# A channel that moves against the model at all shares, correlated at least this much.
+# A channel moves against the model if the correlation is below this at all shares.
 OPPOSED_CORRELATION = -0.6
 
 
 def check_signs(model: Model, recordings: Sequence[Recording]) -> None:
-    """Refuses recordings whose channels move against the model.
+    """Refuse recordings whose channels move against the model.
 
-    The linear part of the model, with the parameters that it has, runs under the recorded input. Rough
-    values will do, as only the direction of each move counts. A resonance that the model puts on the other
-    side of all excited frequencies reverses a channel as well: then a nearer start helps. Recordings with
-    signals are not looked at: what a signal moves may outweigh the input, whether the model has it or not.
+    The linear part of the model is run with its parameters under the recorded input. Rough values are enough,
+    since only the direction of each change counts. A resonance that the model has on the wrong side of all
+    excited frequencies reverses a channel as well; then values nearer to the machine help. Recordings with
+    signals are not checked, since a signal may move the machine more than the input does.
 
     Args:
-        model: Before any fit.
-        recordings: To be fitted.
+        model: The model before any fit.
+        recordings: Recordings that are to be fitted.
 
     Raises:
-        InputError: Channels that move in the opposite direction.
+        InputError: If channels move in the opposite direction.
     """
     against: set[str] = set()
     worst = 0.0
@@ -133,7 +135,7 @@ def _response(discrete: tuple[np.ndarray, np.ndarray], C: np.ndarray, u: np.ndar
         left, pushed = (
             C @ powers[:-1],
             powers[:-1] @ B,
-        )  # what a state and an input do later (L, C, n), (L, n)
+        )  # later effect of a state (L, C, n) and of an input (L, n)
         lag = np.subtract.outer(np.arange(LINEAR_RUN_BLOCK), np.arange(LINEAR_RUN_BLOCK)) - 1
         kernel = np.where(lag[..., None] >= 0, (pushed @ C.T)[lag], 0.0)  # (L, L, C)
         blocks = np.pad(u, (0, -len(u) % LINEAR_RUN_BLOCK)).reshape(-1, LINEAR_RUN_BLOCK)
@@ -146,27 +148,27 @@ def _response(discrete: tuple[np.ndarray, np.ndarray], C: np.ndarray, u: np.ndar
 
 
 def _correlation(a: np.ndarray, b: np.ndarray, step: int) -> float:
-    """Correlation of moves over a number of samples; zero where nothing moves."""
+    """Correlation of the changes of two signals over a number of samples; zero if one does not change."""
     moves = [x[step:] - x[:-step] for x in (a, b)]
     if min(np.ptp(m) for m in moves) == 0:
         return 0.0
     return float(np.corrcoef(moves[0], moves[1])[0, 1])
 
 
-# A size is beyond the recordings where it is more than this many times the largest signal in them.
+# A size is beyond the recordings if it is more than this many times the largest signal in them.
 BEYOND = 3.0
 BEYOND_RECORDINGS = "beyond the recordings"
 """Kind of a remark on such a size."""
 
 
 class Reach(NamedTuple):
-    """How far the signals of some recordings go.
+    """Ranges of the signals of some recordings.
 
     Attributes:
         input: Largest |u| [unit of the input].
-        position: Port -> largest distance from the middle of its travel; channel -> largest |reading|.
-        speed: Port -> largest speed.
-        seconds: The longest recording [s].
+        position: Port -> half of the range of its position; channel -> largest |reading|.
+        speed: Port -> largest |speed|.
+        seconds: Length of the longest recording [s].
     """
 
     input: float
@@ -176,7 +178,7 @@ class Reach(NamedTuple):
 
     @classmethod
     def of(cls, model: Model, recordings: Sequence[Recording]) -> "Reach":
-        """That of recordings, at the ports that their channels determine."""
+        """The ranges of recordings, at the ports whose motion their channels determine."""
         position: dict[str, float] = {}
         speed: dict[str, float] = {}
         for r in recordings:
@@ -191,7 +193,7 @@ class Reach(NamedTuple):
         return cls(voltage, position, speed, max(r.N * r.Ts for r in recordings))
 
     def limit(self, effect: Effect, unit: str) -> tuple[float, str] | None:
-        """The most that the recordings reach of what a parameter is a size of, and what that is."""
+        """Largest value in the recordings of the signal that a parameter is compared with, and its name."""
         if unit == "V" and effect.at == "input":
             return self.input, "the input"
         if unit == "s" and effect.acts_on in ("input", "channel"):
@@ -204,12 +206,12 @@ class Reach(NamedTuple):
 
 
 class Remark(NamedTuple):
-    """What a reader must know of one parameter.
+    """A remark for the reader on one parameter.
 
     Attributes:
         parameter: Full name.
         kind: `BEYOND_RECORDINGS`, "at a bound", or `discretisation_bias.COARSE_STEP`.
-        sentence: In words, with numbers.
+        sentence: The remark in words, with numbers.
     """
 
     parameter: str
@@ -222,16 +224,17 @@ class Remark(NamedTuple):
 
 
 def beyond_recordings(m: Mechanism, reach: Reach, effects: Iterable[Effect] | None = None) -> list[Remark]:
-    """Free parameters of sizes that the recordings do not reach.
+    """Remarks on free parameters of sizes that the recordings do not reach.
 
-    They are sizes of a signal and more than three times as large as it ever was: the recordings cannot tell
-    one size from another, and an effect with such a threshold is inactive. Or they count the repetitions of
-    a law of which the motion covers less than half a period: it is a spring or a constant torque there.
+    There are two cases. A parameter is a size of a signal and more than three times as large as the signal in
+    the recordings: these cannot distinguish such sizes, and an effect with such a threshold is inactive. Or
+    it is the number of periods per turn of a law, and the motion covers less than half a period: there the
+    law is a spring or a constant torque.
 
     Args:
-        m: With the values in question.
-        reach: Of the recordings that they were fitted to.
-        effects: Those that are looked at; all of them if None.
+        m: Mechanism with the values in question.
+        reach: Ranges of the recordings to which they were fitted.
+        effects: Effects that are checked; all of them if None.
     """
     found = []
     for effect in m.effects if effects is None else effects:
@@ -259,7 +262,7 @@ def beyond_recordings(m: Mechanism, reach: Reach, effects: Iterable[Effect] | No
 
 
 def at_bounds(estimates: Iterable[Estimate]) -> list[Remark]:
-    """Free parameters at an end of their range."""
+    """Remarks on free parameters at an end of their range."""
     return [
         Remark(e.name, "at a bound", f"{e.name} = {e.value:.3g} {e.unit}".rstrip() + f" is {_bound(e.note)}")
         for e in estimates

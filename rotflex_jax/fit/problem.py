@@ -1,14 +1,14 @@
-"""Runs of recordings with their slopes, and the likelihood of their errors with its quadratic model.
+"""Runs over recordings with their slopes, and the likelihood of their errors with its quadratic model.
 
     e = y_hat - y,   J = de / dp
     cost = sum over channels of  n ln s + sum e^2 / (2 s^2) - n / 2,   s = max(rms e, floor)
     g = sum J'e / s^2,   H = sum J'J / s^2
 
-The scale of each channel is that of the errors at the same point, so that no channel counts for more than
-it can be explained, and one nat is one nat at every step. Runs with slopes are one compiled program for free
-runs and predictions of any horizon: gains and windows are data.
+The scale of each channel is the size of its errors at the same point, so that channels are weighted by how
+well they can be explained, and a nat has the same meaning at every step. One compiled program computes runs
+with slopes for free runs and predictions of any horizon, since gains and windows are data.
 
-Many starts add up the same sums inside of the run, as that is done on the device.
+`many_starts` computes the same sums inside of the run, on the device.
 """
 
 import dataclasses
@@ -51,18 +51,18 @@ def predicted(
     window: Int[Array, "R N"] | None = None,
     count: Int[Array, ""] | None = None,
 ) -> Float[Array, "R N C"]:
-    """Outputs of R recordings, predicted with gain `K`; a free run where it is zero.
+    """Outputs of R recordings, predicted with gain `K`; free runs if it is zero.
 
     Args:
         structure: Mechanism without values.
         solver: Integration rule.
-        values: Parameter values of each recording.
+        values: Parameter values for each recording.
         x0: First positions and speeds.
-        gates: One factor per effect.
+        gates: Gate of each effect.
         data: The recordings.
-        K: Gains.
-        window: Window of each sample, where runs start again at each; `x0` is then (R, W, s).
-        count: Samples that are run, with windows; all if None.
+        K: Gains for each recording.
+        window: Window of each sample, if runs start again at each window; `x0` is then (R, W, s).
+        count: Number of samples that are run, with windows; all if None.
     """
     run = functools.partial(predictor_run if count is None else first_predictions, structure, solver)
     rows = (values, gates, whole_state(structure, x0), data.u, data.y, data.seen, K, data.Ts)
@@ -75,11 +75,12 @@ def predicted(
 
 
 def each_recording(run: Callable[..., Any], in_axes: tuple[int | None, ...], out_axes: int = 0) -> Callable:
-    """`jax.vmap` over recordings; a single one is run as it is, which takes half the time to trace.
+    """`jax.vmap` over recordings; for a single recording without `vmap`, which halves the time of tracing.
 
     Args:
-        run: What one recording goes through.
-        in_axes: Axis of the recordings in each argument; None where all share it. The first has one.
+        run: Function of one recording.
+        in_axes: Axis of the recordings in each argument, None for an argument that all share; not None for
+            the first argument.
         out_axes: Axis of the recordings in the results.
     """
 
@@ -110,7 +111,7 @@ def normal_equations(
     Args:
         structure: Mechanism without values; static.
         solver: Integration rule; static.
-        numbers: Parameters and states where it runs; a free run where the gain is None.
+        numbers: Parameters, first states and gain; a free run if the gain is None.
         ways: The D directions.
         samples: The recording.
         scale: Size of the error of each channel.
@@ -118,7 +119,7 @@ def normal_equations(
 
     def fold(sums: NormalEquations, y_hat: Array, J: Array, sample: Any) -> tuple[NormalEquations, None]:
         y, counts = sample
-        # Not a product: beyond its last sample a run may diverge.
+        # `where` and not a product, since a run may diverge beyond its last sample.
         e = jnp.where(counts > 0, (y_hat - y) / scale, 0.0)
         J = jnp.where(counts > 0, J / scale[:, None], 0.0)
         each = range(len(e))
@@ -136,13 +137,13 @@ def normal_equations(
 def directions(
     structure: Mechanism, slopes: Float[Array, " P"], free: Int[Array, " K"], states: int
 ) -> TangentDirections:
-    """Directions of the coordinates of some parameters, then of that many positions and speeds.
+    """Directions along the coordinates of some parameters, then along entries of the first state.
 
     Args:
         structure: Mechanism without values.
         slopes: Derivative of each value by its coordinate.
         free: Indices of the parameters.
-        states: How many entries of the first state are free.
+        states: Number of entries of the first state that are free.
     """
     K, D = len(free), len(free) + states
     values = jnp.zeros((D, len(slopes)), slopes.dtype).at[jnp.arange(K), free].set(slopes[free])
@@ -153,13 +154,13 @@ def directions(
 
 @dataclasses.dataclass(frozen=True)
 class RunLayout:
-    """What runs with slopes are compiled for; hashable, so it can be static.
+    """Static data for which runs with slopes are compiled; hashable.
 
     Attributes:
         structure: Mechanism without values.
         solver: Integration rule.
-        states: How many entries of each first state are free.
-        mesh: Devices that the recordings are shared out to; None for one device.
+        states: Number of entries of each first state that are free.
+        mesh: Devices among which the recordings are divided; None for one device.
     """
 
     structure: Mechanism
@@ -182,14 +183,14 @@ def runs_with_slopes(
     """Outputs, and their slopes by the coordinates of free parameters and then by first states.
 
     Args:
-        layout: Static.
-        values: Parameter values of each recording.
-        slopes: Derivative of each value by its coordinate; zero where a recording knows the value.
+        layout: Static data of the program.
+        values: Parameter values for each recording.
+        slopes: Derivative of each value by its coordinate; zero for a constant of the recording.
         free: Indices of the free parameters.
         x0: First positions and speeds.
         data: The recordings.
         K: Gains of the predictor; zero for free runs.
-        window: Window of each sample, where runs start again at each; `x0` is then (R, W, m).
+        window: Window of each sample, if runs start again at each window; `x0` is then (R, W, m).
     """
     structure = layout.structure
 
@@ -214,15 +215,15 @@ def runs(
     K: Float[Array, "R n C"],
     window: Int[Array, "R N"] | None = None,
 ) -> Float[Array, "R N C"]:
-    """Outputs alone, as `runs_with_slopes` gives them.
+    """The outputs of `runs_with_slopes`, without slopes.
 
     Args:
-        layout: Static.
-        values: Parameter values of each recording.
+        layout: Static data of the program.
+        values: Parameter values for each recording.
         x0: First positions and speeds.
         data: The recordings.
         K: Gains of the predictor; zero for free runs.
-        window: Window of each sample, where runs start again at each; `x0` is then (R, W, m).
+        window: Window of each sample, if runs start again at each window; `x0` is then (R, W, m).
     """
     gates = jnp.ones(len(layout.structure.effects), values.dtype)
 
@@ -246,12 +247,12 @@ def free_run_slopes(
     """Outputs of one free run, and their slopes by the free parameters, then by the first state.
 
     Args:
-        layout: What is run, and how many entries of the first state have slopes.
-        values: Parameters.
-        scale: Change of each parameter that its slope is per.
-        free: Indices of the free ones.
+        layout: Mechanism and solver, and the number of entries of the first state that have slopes.
+        values: Parameter values.
+        scale: Unit of each parameter for its slope.
+        free: Indices of the free parameters.
         start: First state.
-        u: Input, signals beside it.
+        u: Input, with signals in further columns.
         Ts: Sampling period [s].
     """
     N, C = len(u), len(layout.structure.channels)
@@ -275,28 +276,28 @@ def channel_scale(
 
     Args:
         costs: Half the sum of squared errors of each channel.
-        samples: How many there are.
-        floor: Least scale.
+        samples: Number of samples.
+        floor: Least scale of each channel.
     """
     return np.maximum(np.sqrt(2 * costs / samples), floor)
 
 
 @dataclasses.dataclass(frozen=True)
 class LikelihoodEquations:
-    """Negative log-likelihood of errors, constants left out, and its quadratic model at one point.
+    """Negative log-likelihood of errors, without constants, and its quadratic model at one point.
 
-    First states meet only the samples of their own window. They are eliminated from each step by their exact
-    least-squares answer, without damping as long as the step of the parameters has little; so a shift of a
-    parameter that first states can follow is not held back by them.
+    First states affect only the samples of their own window. They are eliminated from each step by their
+    exact least-squares solution, which is hardly damped as long as the damping of the parameters is small. So
+    first states do not hold back a change of a parameter that they can follow.
 
     Attributes:
         cost: Negative log-likelihood [nat].
-        scale: Of each channel.
-        gradient: By the M coordinates.
+        scale: Scale of each channel.
+        gradient: Gradient of the cost by the M coordinates.
         H: `J'J` of the scaled errors.
         inner: Which coordinates are eliminated.
-        lower: Room of each coordinate downwards to a bound, zero or less.
-        upper: Room upwards.
+        lower: How far each coordinate may move down to a bound, zero or negative.
+        upper: How far each coordinate may move up to a bound, zero or positive.
         parts: Scaled errors and slopes of each window.
     """
 
@@ -311,16 +312,16 @@ class LikelihoodEquations:
 
     @functools.cached_property
     def nats_that_count(self) -> float:
-        """Nats that say as much as one would if the errors were white."""
+        """Number of nats that count as one, since errors are correlated in time."""
         return nats_that_count(self.parts, self.H)
 
     def promised(self) -> float:
-        """By how much the quadratic model falls to its minimum within the bounds [nat]."""
+        """Decrease of the quadratic model to its minimum within the bounds [nat]."""
         step, _ = self.step(0.0, None)
         return self.predicted_decrease(step) if np.isfinite(step).all() else np.inf
 
     def step(self, damping: Any, limit: Any) -> tuple[Float[np.ndarray, " M"], bool]:
-        """Damped step within limits and bounds, and whether a limit (not a bound) holds it short."""
+        """Damped step within limits and bounds, and whether a limit (not a bound) shortens it."""
         if not (np.isfinite(self.H).all() and np.isfinite(self.gradient).all()):
             return np.full(len(self.gradient), np.nan), False
         size = np.sqrt(np.maximum(np.diag(self.H), 1e-12 * max(np.diag(self.H).max(initial=0.0), 1e-300)))
@@ -345,20 +346,20 @@ class LikelihoodEquations:
         return step / size, bool(at_limit.any())
 
     def predicted_decrease(self, step: Float[np.ndarray, " M"]) -> float:
-        """By how much the quadratic model falls along a step [nat]."""
+        """Decrease of the quadratic model along a step [nat]."""
         return float(-(self.gradient @ step + step @ self.H @ step / 2))
 
 
 def negative_log_likelihood(
     e: Float[np.ndarray, "R N C"], samples: int, floor: Float[np.ndarray, " C"]
 ) -> tuple[float, Float[np.ndarray, " C"]]:
-    """Cost of errors, constants left out [nat], and the scale of each channel.
+    """Cost of errors without constants [nat], and the scale of each channel.
 
         cost = sum over channels of  n ln s + sum e^2 / (2 s^2) - n / 2,   s = max(rms e, floor)
 
     Args:
         e: Errors, zero where a sample does not count.
-        samples: How many count.
+        samples: Number of samples that count.
         floor: Least scale of each channel.
     """
     with np.errstate(over="ignore", invalid="ignore"):
@@ -378,12 +379,12 @@ def likelihood_equations(
     """Likelihood and its quadratic model from errors and slopes.
 
     Args:
-        coordinates: What moves.
+        coordinates: The coordinates of the fit.
         e: Errors, zero where a sample does not count.
-        J: Slopes along the directions of each window.
+        J: Slopes of the errors along the directions of each window.
         seen: Not zero where a sample counts.
         floor: Least scale of each channel.
-        room: How far each coordinate may go down and up.
+        room: How far each coordinate may move down and up.
     """
     cost, scale = negative_log_likelihood(e, int(np.count_nonzero(seen)), floor)
     with np.errstate(over="ignore", invalid="ignore"):

@@ -2,10 +2,10 @@
 
     cost(c) = min of the fit's own cost over all parameters and first states with g(parameters) = c
 
-The quantity is held by a row of its own in the least-squares problem, `(g - c) / w` with a width far below
-its standard deviation. What the minimum of that sum has as its `g` is where the profile is known exactly,
-whatever the width: given its own `g`, nothing lowers the cost. Every point goes through the compiled program
-of the fit, with the parameters of its neighbour as a start.
+The quantity is held by an additional row of the least-squares problem, `(g - c) / w`, with a width `w` far
+below its standard deviation. At the minimum of this sum, the profile is known exactly at the value `g`
+reached there, whatever the width: no other parameters with the same `g` have a lower cost. Every point goes
+through the compiled program of the fit, with the parameters of its neighbour as a start.
 """
 
 import contextlib
@@ -35,38 +35,40 @@ from rotflex_jax.runtime.xla import double_precision, one_thread
 
 # Width of the row that holds the quantity, as a share of its standard deviation.
 WIDTH = 0.02
-# Points that lie between the least cost and the level, to each side, and the most that are tried there.
+# Number of points between the least cost and the level on each side, and largest number of points there.
 POINTS_TO_LEVEL, MOST_POINTS = 4, 16
-# Where the curvature gives no step, the first one; the largest one; and how far a profile goes from the least
-# cost, all as changes of the logarithm of a quantity that is positive.
+# First step if the curvature gives none, largest step, and largest distance from the least cost, as changes
+# of the logarithm of a positive quantity.
 FIRST_STEP, LARGEST, FARTHEST = 0.1, 1.5, 6.0
-# A level is passed where the root is this share beyond it.
+# A level is passed if the root of the likelihood ratio exceeds the root at the level by this factor.
 BEYOND_LEVEL = 1.05
-# The level lies between two points whose roots differ by this share of it at most, or so many are added.
+# Points are added until the level lies between two points whose roots differ by no more than this share of
+# it; largest number of added points.
 NEAR_LEVEL, MOST_BETWEEN = 0.6, 8
-# A value that moves by less than this share of what was asked is at the end of what it may be.
+# A value that moves by less than this share of the step has reached the end of its range.
 STUCK = 0.5
-# A parameter is as good as at its lower bound where it is nearer than this share of its typical size.
+# A parameter counts as at its lower bound if it is nearer to it than this share of its typical size.
 NEAR = 1e-3
-# So many of the last equations are kept: those of two sides and a step that was refused.
+# Number of the last equations that are kept: enough for two sides and a refused step.
 REMEMBERED = 6
 # Step of a difference quotient in the coordinates of a fit.
 STEP = 1e-5
-# The sign of a function is looked at for so many parameters, about so far from the fit in its coordinates.
+# The sign of a function is examined at this many random parameters, with this standard deviation from the fit
+# in unconstrained coordinates.
 DRAWS, AWAY = 100, 2.0
 
 
 @dataclasses.dataclass(frozen=True)
 class Along:
-    """A quantity of a fit, and the coordinate along which a profile walks: its logarithm if always positive.
+    """A quantity of a fit, and the coordinate of its profile: the logarithm of a quantity that is positive.
 
     Attributes:
-        name: For people.
-        unit: Empty for a function.
-        function: From the values of the parameters by full name.
-        limits: Least and largest value that it may have.
-        positive: Whether it walks in logarithms, of the distance to its lower limit.
-        least: Distance below which it walks in equal steps again, so that the limit itself is not far away.
+        name: Name for people.
+        unit: Unit; empty for a function.
+        function: Function of the values of the parameters by full name.
+        limits: Least and largest value that the quantity may have.
+        positive: Whether the coordinate is the logarithm of the distance to the lower limit.
+        least: Distance that is added to it, so that the limit itself is not infinitely far away.
     """
 
     name: str
@@ -78,11 +80,11 @@ class Along:
 
     @classmethod
     def of(cls, of: Quantity, fitted: Fit) -> "Along":
-        """A parameter by its name, or a function.
+        """The quantity that is a parameter, by its name, or a function.
 
         Raises:
-            InputError: A name that is no free parameter, or a function that gives no finite number or is the
-                same whatever the free parameters are.
+            InputError: If the name is no free parameter, if the function gives no finite number, or if it
+                does not depend on a free parameter.
         """
         m = fitted.model.mechanism
         if isinstance(of, str):
@@ -92,7 +94,7 @@ class Along:
                     f"{', '.join(fitted.free_names)}; name one of these."
                 )
             spec = m.parameter_specifications[m.parameter_names.index(of)]
-            # Where both ends are finite, a walk in logarithms would slow down at one of them only.
+            # If both ends are finite, logarithms would refine the steps near one of them only.
             positive = np.isfinite(spec.lower) and not np.isfinite(spec.upper)
             return cls(
                 of,
@@ -145,14 +147,14 @@ class Along:
 
 @dataclasses.dataclass(frozen=True)
 class HeldProblem(GreyBoxProblem):
-    """A fit in which a quantity is held near a number by a row of its own.
+    """A fit in which a quantity is held near a number by an additional row of the least-squares problem.
 
     Attributes:
-        along: The quantity, in the coordinate of its walk.
-        target: Where it is held.
+        along: The quantity and the coordinate of its profile.
+        target: Coordinate at which the quantity is held.
         width: Standard deviation of the row.
-        made: Points with their gains and equations without the row, the last ones: where one point of a
-            profile ends, the next one begins.
+        made: The last points with their gains and equations without the row, since a point of a profile
+            begins where another one ended.
     """
 
     along: Along
@@ -161,12 +163,12 @@ class HeldProblem(GreyBoxProblem):
     made: "deque[tuple[FitPoint, np.ndarray, LikelihoodEquations]]"
 
     def at(self, point: FitPoint) -> tuple[float, Float[np.ndarray, " P"]]:
-        """Value of the quantity, and the values of all parameters, means over recordings."""
+        """Value of the quantity, and the values of all parameters (means over recordings)."""
         common, names = self.common(self.physical(point)[0]), self.model.mechanism.parameter_names
         return float(self.along.function(dict(zip(names, common.tolist(), strict=True)))), common
 
     def slopes(self, point: FitPoint, windows: Windows) -> Float[np.ndarray, " M"]:
-        """Derivative of the walked coordinate of the quantity by the coordinates of the fit."""
+        """Derivative of the coordinate of the profile by the coordinates of the fit."""
         coordinates = self.coordinates(point, windows)
         move = np.zeros(coordinates.size)
         found = np.zeros(coordinates.size)
@@ -181,13 +183,13 @@ class HeldProblem(GreyBoxProblem):
         return found
 
     def penalty(self, point: FitPoint) -> float:
-        """What the row adds to the cost."""
+        """The cost of the additional row."""
         return ((self.along.walked(self.at(point)[0]) - self.target) / self.width) ** 2 / 2
 
     def equations(
         self, point: FitPoint, stage: FitStage, K: Float[np.ndarray, "R n C"]
     ) -> LikelihoodEquations:
-        """Those of the fit with the row of the quantity."""
+        """The equations of the fit, with the row of the quantity."""
         found = next((e for at, gain, e in self.made if at is point and np.array_equal(gain, K)), None)
         if found is None:
             found = super().equations(point, stage, K)
@@ -204,7 +206,7 @@ class HeldProblem(GreyBoxProblem):
 
 @dataclasses.dataclass(frozen=True)
 class PointOfProfile:
-    """One point: the value, its cost without the row that holds it, where the fit is, all parameters."""
+    """A point of a profile: value, cost without the additional row, point of the fit, and all parameters."""
 
     value: float
     cost: float
@@ -214,16 +216,16 @@ class PointOfProfile:
 
 @dataclasses.dataclass(frozen=True)
 class Walk:
-    """What a profile needs at the least cost.
+    """The computation of the points of a profile, outwards from the least cost.
 
     Attributes:
-        problem: Of the fit.
+        problem: Problem of the fit.
         along: The quantity.
-        end: The least cost.
-        middle: The same as a point.
-        std: Wald's standard deviation of the walked coordinate; nan where there is none.
-        factor: Nats that say as much as one.
-        made: As a `HeldProblem` has them.
+        end: The fit with the least cost.
+        middle: The point of the profile there.
+        std: Wald's standard deviation of the coordinate of the profile; nan if there is none.
+        factor: Number of nats of the cost that count as one; see `profile`.
+        made: Last equations, as in `HeldProblem`.
     """
 
     problem: GreyBoxProblem
@@ -235,11 +237,11 @@ class Walk:
     made: "deque[tuple[FitPoint, np.ndarray, LikelihoodEquations]]"
 
     def root(self, point: PointOfProfile) -> float:
-        """Root of the likelihood ratio, of either side."""
+        """Root of the likelihood ratio of a point, without sign."""
         return float(np.sqrt(max(2 * (point.cost - self.middle.cost) / self.factor, 0.0)))
 
     def held(self, target: float, start: FitPoint) -> PointOfProfile:
-        """The least cost with the quantity near a target."""
+        """The point of the profile near a target coordinate."""
         width = WIDTH * (self.std if np.isfinite(self.std) else FIRST_STEP)
         given = {f.name: getattr(self.problem, f.name) for f in dataclasses.fields(GreyBoxProblem)}
         problem = HeldProblem(**given, along=self.along, target=target, width=width, made=self.made)
@@ -248,7 +250,7 @@ class Walk:
         return PointOfProfile(value, found.cost - problem.penalty(found.point), found.point, values)
 
     def side(self, way: int, goal: float) -> list[PointOfProfile]:
-        """Points to one side, outwards until the root is beyond the goal or nothing is left to find."""
+        """Points on one side, outwards until the root exceeds the goal or the quantity moves no further."""
         begin = self.along.walked(self.middle.value)
         step = goal / POINTS_TO_LEVEL * self.std if np.isfinite(self.std) else FIRST_STEP
         most = LARGEST if self.along.positive else np.inf
@@ -258,7 +260,7 @@ class Walk:
             at, root = self.along.walked(here.value), self.root(here)
             target = at + way * step
             if not self.along.positive:
-                # The last point before a limit that is never reached itself.
+                # The coordinate approaches a limit but does not reach it.
                 target = float(np.clip(target, (at + 3 * low) / 4, (at + 3 * high) / 4))
             further = self.held(target, here.point)
             moved = way * (self.along.walked(further.value) - at)
@@ -277,12 +279,12 @@ class Walk:
     def nearer(
         self, found: list[PointOfProfile], inside: PointOfProfile, goal: float
     ) -> list[PointOfProfile]:
-        """Points between the last two of a side, until the level lies between two that are near each other.
+        """Points of a side with more points added, until the level lies between two that are close together.
 
         Args:
-            found: Points of the side; the last is beyond the level.
-            inside: The one before, or the middle.
-            goal: Root at the level.
+            found: Points of the side, of which the last is beyond the level.
+            inside: The point before the last one, or the middle.
+            goal: Root of the likelihood ratio at the level.
         """
         outside, added = found[-1], list[PointOfProfile]()
         for _ in range(MOST_BETWEEN):
@@ -308,27 +310,27 @@ def profile(
         2 (cost(c) - least cost) / factor <= quantile of chi2 with 1 degree of freedom at `level`
 
     `cost(c)` is the cost of the fit with the quantity held at `c` and everything else fitted again: the other
-    parameters, those of each recording, and first states. The interval of all `c` that pass need not be
-    symmetric, may be open where the recordings set no end, and may have a gap. `factor` is the ratio of the
-    variance that allows for errors correlated in time to the one by curvature alone, so that the interval is
-    Wald's where the cost is a parabola. Points are placed outwards from the least cost, each as far from the
-    last as the profile is steep, in the fit's own compiled program. First states that the fit has taken as
-    measured follow the parameters, which Wald's interval leaves out: the two then differ.
+    parameters, local parameters of each recording, and first states. The interval of all `c` that satisfy the
+    inequality need not be symmetric. It may be open if the recordings set no end, and it may have a gap.
+    `factor` is the variance that allows for errors correlated in time, divided by the variance from the
+    curvature alone. So the interval equals Wald's interval if the cost is a parabola. Points are placed
+    outwards from the least cost, closer together where the profile is steep, with the fit's own compiled
+    program. If the fit has used measured first states, these follow the parameters here. Wald's interval
+    neglects this, and the two differ.
 
     Args:
         fitted: A fit by `rotflex_jax.fit`; its options are used again.
-        recordings: Those that were fitted.
+        recordings: The recordings that were fitted.
         of: Full name of a free parameter, or a function that receives the values of all parameters by full
             name and gives a number: `lambda p: p["hub.coulomb.level"] / p["joint.spring.stiffness"]`.
-        level: Up to which confidence level the profile reaches; never less than 0.95, by which its shape is
-            told.
+        level: Confidence level up to which points are placed; at least 0.95, which `shape` needs.
 
     Returns:
         Profile with `interval(level)`, `shape`, `wald` and a figure.
 
     Raises:
-        InputError: No such parameter, a function that gives no number or that no fitted parameter moves, or
-            other recordings than were fitted.
+        InputError: If there is no such parameter, if the function gives no number or depends on no fitted
+            parameter, or if the recordings are not those that were fitted.
 
     Source: S. A. Murphy and A. W. van der Vaart, J. Am. Stat. Assoc. 95, 2000; A. Raue et al., Bioinformatics
     25, 2009; the factor: R. E. Chandler and S. Bate, Biometrika 94, 2007.
@@ -365,26 +367,26 @@ def profile(
 
 
 def _about(of: Callable[[Mapping[str, float]], float], m: Mechanism, free: Sequence[str]) -> list[float]:
-    """A function at random parameters: a ratio is positive at all, a constant the same."""
+    """Values of a function at random parameters, which show whether it is positive or constant."""
     rng, transform = np.random.default_rng(0), Transform.of(m.parameter_specifications)
     z, moves = transform.unconstrain(m.values), np.isin(m.parameter_names, free)
     found = []
     for _ in range(DRAWS):
         values = transform.physical(np.where(moves, z + AWAY * rng.standard_normal(len(z)), z))[0]
-        # Where it fails, the parameters are outside of what it is for.
+        # Where the function fails, the parameters are outside of its domain.
         with contextlib.suppress(TypeError, ValueError, ArithmeticError), np.errstate(all="ignore"):
             found.append(float(of(dict(zip(m.parameter_names, values.tolist(), strict=True)))))
     return found
 
 
 def _distinct(values: list[float]) -> list[bool]:
-    """Which of ascending values differ from the one before."""
+    """For ascending values, whether each differs from the value before."""
     size = max(abs(values[0]), abs(values[-1]))
     return [True, *(b - a > 1e-12 * size for a, b in itertools.pairwise(values))]
 
 
 def _at_least(fitted: Fit, recordings: Sequence[Recording], along: Along) -> Walk:
-    """The least cost next to a fit, and what its curvature says of the quantity."""
+    """The start of a profile: the least cost near a fit, and the variance of the quantity there."""
     problem, point, stage = problem_of(fitted, recordings)
     end = problem.attempt(point, [stage])
     here = problem.equations(end.point, stage, end.K)
@@ -394,10 +396,10 @@ def _at_least(fitted: Fit, recordings: Sequence[Recording], along: Along) -> Wal
     value, values = held.at(end.point)
     row = held.slopes(end.point, stage.windows)
     again = report(problem, end, *problem.errors(end.point, stage, end.K))
-    # The variance of the walked coordinate by the curvature alone, of what no end of a range holds.
+    # Variance of the profile's coordinate by the curvature alone, for coordinates not held at an end.
     moves = ~problem.held_by_ends(end.point, stage.windows)
     plain = _variance(here.H[np.ix_(moves, moves)], row[moves])
-    # By the names of the parameters, as their covariance has them.
+    # Gradient of the profile's coordinate by the parameters, in the order of their covariance.
     m = again.model.mechanism
     base = m.named_values
     transform = Transform.of(m.parameter_specifications)
@@ -423,7 +425,7 @@ def _at_least(fitted: Fit, recordings: Sequence[Recording], along: Along) -> Wal
 
 
 def _variance(H: Float[np.ndarray, "M M"], row: Float[np.ndarray, " M"]) -> float:
-    """`row' H^-1 row`; nan where the quantity moves along what the curvature does not determine."""
+    """`row' H^-1 row`; nan if the quantity depends on directions that the curvature does not determine."""
     size = np.sqrt(np.maximum(np.diag(H), 1e-300))
     eigenvalues, vectors = np.linalg.eigh(H / np.outer(size, size))
     along = vectors.T @ (row / size)

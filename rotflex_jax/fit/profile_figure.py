@@ -1,4 +1,4 @@
-"""Figure of profiles: the drop of the likelihood over a quantity beside the parabola of its Wald interval."""
+"""Figure of profiles: the drop of the likelihood over a quantity, with the parabola of its Wald interval."""
 
 from collections.abc import Sequence
 
@@ -14,7 +14,7 @@ from rotflex_jax.text.plotting import blank, legend_above, styled
 
 @styled
 def profile_figure(profiles: Sequence[Profile]) -> Figure:
-    """One panel for each profile, at most three beside each other."""
+    """One panel for each profile, at most three in a row."""
     columns = min(len(profiles), 3)
     rows = -(-len(profiles) // columns)
     figure = blank(10.0 if columns > 1 else 5.5, 2.7 * rows + 0.4)

@@ -1,4 +1,4 @@
-"""Result of a profile: the likelihood along one quantity, the interval it gives, and what it looks like."""
+"""Result of a profile: the likelihood along one quantity, its interval and its shape."""
 
 import dataclasses
 import math
@@ -21,34 +21,35 @@ if TYPE_CHECKING:
 Quantity = str | Callable[[Mapping[str, float]], float]
 """Full name of a parameter, or a function from the values of all parameters by full name to a number."""
 
-# A Wald interval is poor where an end of it lies at another level: its root of the likelihood ratio is off
-# 1.96 by more than this share. 0.15 is 90 or 97.6 % at one end in place of 95 %.
+# A Wald interval is poor if the root of the likelihood ratio at one of its ends differs from 1.96 by more
+# than this share. With 0.15, this end belongs to a level of 90 or 97.6 % instead of 95 %.
 POOR = 0.15
-# Every profile reaches this level: shape and sentence are those of its interval.
+# Every profile reaches this level, since its shape and its sentence are about the interval of this level.
 LEAST_LEVEL = 0.95
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Profile:
-    """The likelihood along one quantity, with all else fitted again at each value.
+    """The likelihood along one quantity, with everything else fitted again at each value.
 
         drop = 2 (cost(value) - least cost) / factor,   interval: drop <= quantile of chi2 with 1 degree
 
-    `factor` is by how much the errors' correlation in time widens the variance of the quantity (the ratio of
-    sandwich and inverse curvature), so that profile and Wald interval agree where the cost is a parabola.
+    `factor` is the factor by which the correlation of errors in time increases the variance of the quantity
+    (the ratio of sandwich and inverse curvature). So profile and Wald interval agree if the cost is a
+    parabola.
 
     Attributes:
-        name: Of the quantity.
-        unit: Its unit; empty for a function of parameters.
-        value: Where the cost is least.
+        name: Name of the quantity.
+        unit: Unit of the quantity; empty for a function of parameters.
+        value: Value of the quantity at the least cost.
         values: Values of the quantity, ascending.
         drop: Twice the loss of log-likelihood over `factor`; zero at `value`.
-        factor: Nats of the cost that say as much as one.
-        std: Wald's standard deviation; nan where the curvature gives none.
-        limits: Ends of what the quantity may be.
+        factor: Number of nats of the cost that count as one.
+        std: Wald's standard deviation; nan if the curvature gives none.
+        limits: Least and largest value that the quantity may have.
         nuisances: Values of all parameters at each value.
-        parameter_names: Their full names.
-        gained: By how much the least cost is below that of the fit [nat]; zero if the fit was the least.
+        parameter_names: Full names of these parameters.
+        gained: Cost of the fit less the least cost [nat]; zero if the fit has the least cost.
         level: Confidence level up to which points were placed.
     """
 
@@ -71,17 +72,17 @@ class Profile:
         return self.wald_interval(0.95)
 
     def wald_interval(self, level: float) -> tuple[float, float]:
-        """The symmetric interval of another level."""
+        """The symmetric interval from the curvature, of any level."""
         half = float(scipy.stats.norm.ppf((1 + level) / 2)) * self.std
         return self.value - half, self.value + half
 
     @property
     def root(self) -> Float[np.ndarray, " K"]:
-        """Signed root of the drop, negative below the least cost; a straight line for a parabola."""
+        """Signed root of the drop, negative below `value`; a straight line if the cost is a parabola."""
         return np.sign(self.values - self.value) * np.sqrt(np.maximum(self.drop, 0.0))
 
     def root_at(self, values: Float[np.ndarray, " V"]) -> Float[np.ndarray, " V"]:
-        """The signed root between the points of the profile, nan outside of them."""
+        """The signed root, interpolated between the points of the profile; nan outside of them."""
         if len(self.values) < 2:
             return np.where(values == self.value, 0.0, np.nan)
         return scipy.interpolate.PchipInterpolator(self.values, self.root, extrapolate=False)(values)
@@ -90,10 +91,10 @@ class Profile:
         """All values that are not excluded, as intervals; an open end is an end of `limits`.
 
         Args:
-            level: Confidence level, at most that of the profile.
+            level: Confidence level, at most the level of the profile.
 
         Raises:
-            InputError: A level that is not between 0 and 1, or above that of the profile.
+            InputError: If the level is not between 0 and 1, or above the level of the profile.
         """
         level = checks.number(level, "level", above=0, below=1, example="0.95")
         if level > self.level:
@@ -114,13 +115,13 @@ class Profile:
         return list(zip(edges[::2], edges[1::2], strict=True))
 
     def interval(self, level: float = 0.95) -> tuple[float, float]:
-        """From the least to the largest value that is not excluded; `regions` has the gaps between.
+        """The interval from the least to the largest value that is not excluded; `regions` shows gaps.
 
         Args:
-            level: Confidence level, at most that of the profile.
+            level: Confidence level, at most the level of the profile.
 
         Raises:
-            InputError: A level that is not between 0 and 1, or above that of the profile.
+            InputError: If the level is not between 0 and 1, or above the level of the profile.
         """
         found = self.regions(level)
         return found[0][0], found[-1][1]
@@ -136,7 +137,7 @@ class Profile:
 
     @property
     def wald_is_poor(self) -> bool:
-        """Whether the parabola misleads, the profile being at another level at an end of Wald's interval."""
+        """Whether Wald's interval misleads: the profile is not closed, or an end has another level."""
         if not math.isfinite(self.std) or self.shape != "closed":
             return True
         at = self.root_at(np.array(self.wald))
@@ -144,9 +145,9 @@ class Profile:
 
     @property
     def sentence(self) -> str:
-        """What is known of the quantity, in words."""
+        """What the recordings show of the quantity, in words."""
         (low, high), (factor, unit) = self.interval(), as_read(1.0, self.unit)
-        # As many digits as the interval is worth.
+        # As many digits as are significant by the interval.
         width = min((b - a for a, b in self.regions() if math.isfinite(b - a)), default=math.inf)
         worth = math.log10(max(abs(self.value) / width, 1.0)) if width > 0 else 3.0
         shown = lambda v: digits(factor * v, 3 + math.floor(worth))  # noqa: E731
@@ -178,13 +179,13 @@ class Profile:
         }
 
     def plot(self) -> "Figure":
-        """The drop over the quantity beside the parabola of the Wald interval, with both 95 % intervals."""
+        """Figure of the drop over the quantity, with the parabola of Wald and both 95 % intervals."""
         from rotflex_jax.fit.profile_figure import profile_figure  # takes long to import
 
         return profile_figure([self])
 
     def _repr_html_(self) -> str:
-        """Both intervals side by side, and what the profile says in words."""
+        """A card with both intervals and the sentence of the profile."""
         rows = []
         for what, (low, high) in (("profile", self.interval()), ("Wald", self.wald)):
             (a, unit), (b, _) = readable(low, self.unit), readable(high, self.unit)

@@ -27,24 +27,24 @@ if TYPE_CHECKING:
     from rotflex_jax.fit.profile_result import Profile, Quantity
 
 
-# A parameter with a bound whose 95 % interval is wider than this share of it, to either side, hardly has a
-# symmetric one.
+# A symmetric 95 % interval is in doubt if its half width exceeds this share of the distance to the nearest
+# bound.
 WIDE_INTERVAL = 0.3
 
 
 @dataclasses.dataclass(frozen=True)
 class FitOptions:
-    """How a fit was asked for, so that what follows from it asks the same.
+    """Options of a fit, so that later computations such as a profile use the same.
 
     Attributes:
-        process_noise: Port -> intensity of the process torque [(N m)^2 s]; None for a free run.
-        local: Parameters that each recording has for itself.
-        first: Whether first states were fitted, or held at what the first samples show.
-        window_seconds: Runs started again so often [s]; None for whole recordings.
-        max_steps: Most iterations of each minimisation.
-        restarts: Most restarts.
-        bend: Errors of each channel beyond which they counted by their size [unit of the channel]; None where
-            all counted by their square.
+        process_noise: Port -> intensity of the process noise [(N m)^2 s]; None for a free run.
+        local: Full names of parameters with a value for each recording.
+        first: "fitted" if first states were fitted, "measured" if they were held at what first samples show.
+        window_seconds: Length of windows after which runs started again [s]; None for whole recordings.
+        max_steps: Largest number of iterations of each minimisation.
+        restarts: Largest number of restarts.
+        bend: Size of an error in each channel beyond which errors counted linearly [unit of the channel];
+            None if all errors counted by their square.
     """
 
     process_noise: dict[str, float] | None = None
@@ -64,20 +64,20 @@ class Fit:
         model: The fitted model.
         cost: Negative log-likelihood of all samples of all recordings, constants included [nat].
         status: "converged", or in words what stopped the fit.
-        parameters: Estimates, free and held.
-        noise: Standard deviation of the residual per channel [unit of the channel].
-        covariance: Of the F free parameters [declared units], in the order of `free_names`.
+        parameters: Estimates of all parameters, free and held.
+        noise: Channel -> root mean square of the residual [unit of the channel].
+        covariance: Covariance of the F free parameters [declared units], in the order of `free_names`.
         free_names: Full names of the free parameters.
-        steps: Iterations of all attempts together.
-        history: Negative log-likelihood after each minimisation that led here, constants left out [nat].
-        local: Parameter that each recording has for itself -> its estimates, in the order of the
-            recordings; `parameters` has the mean.
-        remarks: Parameters at a bound, far beyond what the recordings reach, or moved by steps of integration
-            that are too long, each with a sentence.
-        options: How it was asked for.
-        Ts: Sampling period of the first recording [s], which a saved model keeps; None where none is known.
-        n_init: Samples at its start that the fit looked at, or None.
-        data: Digest of the recordings, in their order; "" where it is not known.
+        steps: Number of evaluations in all attempts together.
+        history: Negative log-likelihood after each minimisation that led here, without constants [nat].
+        local: Full name of each local parameter -> its estimates in each recording; `parameters` has the
+            mean.
+        remarks: Remarks on parameters at a bound, far beyond what the recordings reach, or changed by
+            integration steps that are too long.
+        options: Options of the fit.
+        Ts: Sampling period of the first recording [s], which a saved model keeps; None if unknown.
+        n_init: Number of first samples of the first recording that give its first state; None if unknown.
+        data: Digest of the recordings, in their order; "" if unknown.
     """
 
     model: Model
@@ -98,10 +98,10 @@ class Fit:
 
     @property
     def profile_advised(self) -> tuple[str, ...]:
-        """Free parameters whose symmetric interval is in doubt by its own numbers, without any run.
+        """Free parameters whose symmetric interval is in doubt; no run is needed to see this.
 
-        They have no interval, or one that reaches a bound, or a bound and an interval of more than 30 % to
-        either side. `rotflex_jax.profile` gives them a better one.
+        They have no interval; or they have a bound, and half the width of the interval is more than 30 % of
+        the distance to it. `rotflex_jax.profile` gives a better interval.
         """
         m = self.model.mechanism
         specs = dict(zip(m.parameter_names, m.parameter_specifications, strict=True))
@@ -115,30 +115,30 @@ class Fit:
         return tuple(found)
 
     def profile(self, of: "Quantity", recordings: "Recording | Sequence[Recording]") -> "Profile":
-        """Profile likelihood of a parameter or of a function of parameters; as `rotflex_jax.profile`.
+        """Profile likelihood of a parameter or of a function of parameters; see `rotflex_jax.profile`.
 
         Args:
-            of: Full name, or a function from the values by full name to a number.
-            recordings: Those that were fitted.
+            of: Full name of a parameter, or a function of the values by full name that gives a number.
+            recordings: The recordings that were fitted.
         """
         from rotflex_jax.fit.profile import profile  # imported on request: it needs this module
 
         return profile(self, recordings, of)
 
     def profiles(self, recordings: "Recording | Sequence[Recording]") -> "dict[str, Profile]":
-        """Profiles of the parameters for which one is advised, by full name.
+        """Full name -> profile, for the parameters of `profile_advised`.
 
         Args:
-            recordings: Those that were fitted.
+            recordings: The recordings that were fitted.
         """
         return {name: self.profile(name, recordings) for name in self.profile_advised}
 
     def model_of(self, recording: int) -> Model:
-        """The model with the local parameters of one of the fitted recordings, by its number."""
+        """The model with the local parameters of one of the fitted recordings, given by its index."""
         return self.model.with_values({name: each[recording].value for name, each in self.local.items()})
 
     def with_values(self, values: Mapping[str, float]) -> "Fit":
-        """The fit with other values of some parameters in its model; its estimates stay."""
+        """The fit with other values of some parameters in its model; its estimates do not change."""
         return dataclasses.replace(self, model=self.model.with_values(values))
 
     def __getitem__(self, name: str) -> Estimate:
@@ -153,7 +153,7 @@ class Fit:
 
     @property
     def ending(self) -> str:
-        """How the fit ended and after how many steps, each said once."""
+        """The status of the fit and the number of steps, in words."""
         counted = re.search(r"\bafter \d+ steps\b", self.status)
         return self.status if counted else f"{self.status} after {self.steps} steps"
 
@@ -165,16 +165,16 @@ class Fit:
         return save(Saved(*own, self.Ts, self.n_init), path)
 
     def plot(self, recording: Recording, seconds: float | None = None) -> "Figure":
-        """Measured against simulated outputs, with errors and the fit in per cent; a notebook shows it.
+        """Figure of measured and simulated outputs, with errors and the fit in per cent.
 
         Args:
-            recording: What was measured, best one that was not fitted.
-            seconds: Runs start again so often [s]; one free run over all of it unless given.
+            recording: A recording, preferably one that was not fitted.
+            seconds: Length of windows after which runs start again [s]; None for one free run over all of it.
         """
         return compare_plot(recording, self, seconds=seconds)
 
     def _repr_html_(self) -> str:
-        """How the fit ended, its residuals, and every parameter with unit and interval."""
+        """A card with the status of the fit, its residuals, and every parameter with unit and interval."""
         residuals, estimates, widths = [], [], []
         for channel, own in output_units(self.model.mechanism).items():
             value, unit = readable(self.noise[channel], own)

@@ -1,4 +1,4 @@
-"""Weights of a basis by least squares: all at once, or one by one as long as validation blocks gain."""
+"""Weights of a basis by least squares: all at once, or one by one as long as held-out blocks improve."""
 
 import dataclasses
 import math
@@ -28,22 +28,22 @@ from rotflex_jax.recording import Recording
 
 @dataclasses.dataclass(frozen=True)
 class SeriesFit:
-    """Fitted weights on a basis; what has the same name in `Fit` means the same.
+    """Fitted weights on a basis; attributes with the same name as in `Fit` have the same meaning.
 
     Attributes:
         model: The series.
         cost: Negative log-likelihood of the samples, constants included [nat].
-        status: "converged", or in words what a reader must know.
-        parameters: The weights as estimates, named after their regressors; intervals are robust to
-            residuals that are correlated in time, as those of a wrong model are.
-        noise: Root mean square of the residual of the channel [its unit].
-        covariance: Of the weights (P, P).
+        status: "converged", with a remark for the reader if there is one.
+        parameters: The weights as estimates, named after their regressors. Intervals allow for residuals that
+            are correlated in time, as they are if the model is incomplete.
+        noise: Channel -> root mean square of its residual [unit of the channel].
+        covariance: Covariance of the weights (P, P).
         nmse: Squared error over the squared deviation from the mean, on the samples of the fit.
-        rank: Directions of the weights that the data determine.
-        condition: Largest over smallest eigenvalue of `phi' phi` within these.
+        rank: Number of directions of the weights that the data determine.
+        condition: Largest over smallest eigenvalue of `phi' phi` within these directions.
         ridge: Penalty on the squared weights.
-        err: Chosen regressor -> its error-reduction ratio, in the order of choice; empty where all
-            regressors were fitted.
+        err: Chosen regressor -> its error-reduction ratio, in the order of choice; empty if all regressors
+            were fitted.
     """
 
     model: Series
@@ -60,23 +60,23 @@ class SeriesFit:
 
     @property
     def weights(self) -> Float[np.ndarray, " P"]:
-        """(P,)."""
+        """Weights (P,)."""
         return self.model.weights
 
     @property
     def std(self) -> Float[np.ndarray, " P"]:
-        """Standard deviations (P,); nan where the data say nothing."""
+        """Standard deviations of the weights (P,); nan where the data do not determine a weight."""
         return np.array([e.std for e in self.parameters])
 
     @property
     def t(self) -> Float[np.ndarray, " P"]:
-        """Weights over their standard deviations (P,); beyond about 3 they are not nothing."""
+        """Weights over their standard deviations (P,); beyond about 3 a weight differs from zero."""
         with np.errstate(divide="ignore", invalid="ignore"):
             return self.weights / self.std
 
     @property
     def selected(self) -> tuple[str, ...]:
-        """Regressors that were chosen, the best first; all where none was left out."""
+        """Names of the chosen regressors, in the order of choice; all regressors if none was left out."""
         return tuple(self.err) or tuple(e.name for e in self.parameters)
 
     def __getitem__(self, name: str) -> Estimate:
@@ -120,22 +120,22 @@ def series_fit(
     err: Mapping[str, float] | None = None,
     columns: Int[np.ndarray, " K"] | None = None,
 ) -> SeriesFit:
-    """The result from the solution of a linear least-squares problem.
+    """The fit of a series, from the solution of a linear least-squares problem.
 
     Args:
         series: Model with the fitted weights.
-        solution: In terms of the columns that were fitted.
-        rows: Regressors and targets of all columns.
-        status: In words.
+        solution: Solution in the columns that were fitted.
+        rows: Regressors and targets, with all columns.
+        status: Status in words.
         ridge: Penalty of the fit.
         err: Error-reduction ratios.
-        columns: Those that were fitted (P'); all if None.
+        columns: Indices of the columns that were fitted (P'); all if None.
     """
     P = series.basis.size
     columns = np.arange(P) if columns is None else columns
     phi = rows.phi if len(columns) == P else rows.phi[:, columns]
     e = rows.y - phi @ solution.w
-    # In the directions that the data determine, so that columns that depend on each other do no harm.
+    # Computed in the directions that the data determine, so that dependent columns do no harm.
     along = phi @ solution.basis
     way = solution.basis * solution.shrink
     parts = by_recording(along[:, None, :], e[:, None], rows.segments)
@@ -184,22 +184,23 @@ def least_squares(
 
         minimise  sum_t (y[t] - w' phi[t])^2 + ridge |w|^2
 
-    By orthogonal triangularisation of the rows, never by their squares. Where columns depend on each
-    other, as in the full layout of a Volterra series, the weights of least norm are given, which are
-    symmetric. Not for a recording that does not begin at rest, unless the first samples, as many as
-    the basis reaches back, are skipped: the basis knows no earlier input.
+    The rows are triangularised orthogonally (QR), without normal equations. If columns depend on each other,
+    as in the full layout of a Volterra series, the weights of least norm are given, which are symmetric. Do
+    not use it for a recording that does not begin at rest, unless as many first samples are skipped as the
+    basis reaches back: the basis has no input before the recording.
 
     Args:
         basis: Regressors.
-        recordings: One or several, of one sampling period.
-        channel: Output to model; may be left out where there is one.
-        ridge: Penalty on the squared weights, as they are; "cv" takes the one with the least error on
-            contiguous blocks left out in turn. An interval does not contain the bias of a ridge.
+        recordings: One or several recordings, with one sampling period.
+        channel: Output to model; may be left out if there is only one.
+        ridge: Penalty on the squared weights, which are not scaled. "cv" takes the ridge with the least error
+            on contiguous blocks left out in turn. Intervals do not include the bias of a ridge.
         skip: Samples at the start of each recording to leave out; its `n_init` if None.
-        blocks: How many, for "cv".
+        blocks: Number of blocks for "cv".
 
     Raises:
-        InputError: Nothing to fit, different sampling periods, no such channel, a negative ridge.
+        InputError: If there is nothing to fit, if sampling periods differ, if there is no such channel, or if
+            the ridge is negative.
 
     Source: Golub and Van Loan 2013, Matrix Computations, sections 5.3 and 5.5.
 
@@ -242,7 +243,7 @@ def least_squares(
     return series_fit(series, solution, rows, status, penalty)
 
 
-# A regressor of which less than this share is left depends on those chosen before.
+# A regressor of which no more than this share is left depends linearly on the regressors chosen before.
 DEPENDENT_REGRESSOR_SHARE = 1e-9
 
 
@@ -260,28 +261,28 @@ def forward_regression(
 
         ERR_i = (q_i' y)^2 / (q_i' q_i  y' y),  q_i = what is left of regressor i after those chosen
 
-    The regressor with the largest error-reduction ratio comes next. How many is decided on contiguous
-    blocks: each is left out in turn, the choice is made again without it, and the smallest number is
-    taken whose error there is within one standard error of the least. The ratios add up to the share of
-    `y' y` that is explained.
+    The regressor with the largest error-reduction ratio is chosen next. Their number is decided on contiguous
+    blocks: each block is left out in turn, and the choice is made again without it. The smallest number is
+    taken whose error on the blocks left out is within one standard error of the least error. The ratios add
+    up to the share of `y' y` that is explained.
 
-    The intervals take the choice for given, so they are too narrow. Not where regressors are strongly
-    correlated and the structure matters: which of two similar ones is chosen is a matter of chance.
+    The intervals do not allow for the choice, so they are too narrow. Do not use it where regressors are
+    strongly correlated and the structure matters: chance decides which of two similar regressors is chosen.
 
     Args:
-        basis: Candidates.
-        recordings: One or several, of one sampling period.
-        channel: Output to model; may be left out where there is one.
-        terms: How many to choose; decided on validation blocks if None.
-        most: Most that are tried.
+        basis: Candidate regressors.
+        recordings: One or several recordings, with one sampling period.
+        channel: Output to model; may be left out if there is only one.
+        terms: Number of regressors to choose; if None, it is decided on blocks left out in turn.
+        most: Largest number that is tried.
         skip: Samples at the start of each recording to leave out; its `n_init` if None.
-        blocks: How many, to decide.
+        blocks: Number of blocks.
 
     Returns:
-        Fit whose model has weight 0 where a regressor was not chosen; `err` holds the ratios.
+        Fit whose model has weight 0 for regressors that were not chosen; `err` has the ratios.
 
     Raises:
-        InputError: As `least_squares`; too few blocks.
+        InputError: As `least_squares`, or if there are too few blocks.
 
     Source: Billings, Chen and Korenberg 1989, Int. J. Control 49; Chen, Billings and Luo 1989, Int. J.
     Control 50, section 3.2.
@@ -324,11 +325,11 @@ def forward_regression(
 
 
 def forward_path(R: Float[np.ndarray, "K K"], most: int) -> tuple[list[int], list[float]]:
-    """Columns in the order of choice and their error-reduction ratios.
+    """Columns in the order of choice, and their error-reduction ratios.
 
     Args:
-        R: Triangular factor of `[phi, y]`: angles between columns are those between the regressors.
-        most: How many to choose; fewer where nothing independent is left.
+        R: Triangular factor of `[phi, y]`, whose columns have the same inner products as `[phi, y]`.
+        most: Number of columns to choose; fewer are chosen if no independent one is left.
     """
     left, z = R[:, :-1].copy(), R[:, -1]
     whole_y = max(float(z @ z), 1e-300)
@@ -345,14 +346,14 @@ def forward_path(R: Float[np.ndarray, "K K"], most: int) -> tuple[list[int], lis
         q = left[:, k] / size[k]
         order.append(k)
         ratios.append(float(gains[k]) / whole_y)
-        # Twice is enough: the second pass removes what rounding left of the first.
+        # Two passes are enough: the second one removes what the first one leaves by rounding.
         for _ in range(2):
             left -= np.outer(q, q @ left)
     return order, ratios
 
 
 def _how_many(parts: list[Float[np.ndarray, "K K"]], most: int) -> int:
-    """Fewest terms whose held-out error is within one standard error of the least."""
+    """Smallest number of terms whose error on held-out blocks is within one standard error of the least."""
     errors = np.empty((len(parts), most + 1))
     for k, held in enumerate(parts):
         R = factor(np.concatenate([p for j, p in enumerate(parts) if j != k]))

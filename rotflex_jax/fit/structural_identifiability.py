@@ -1,10 +1,10 @@
-"""What a linear machine can tell at all: ranks in exact arithmetic, and directions in words.
+"""Structural identifiability of a linear machine in exact arithmetic, and unknown directions in words.
 
     y(t) = C exp(A t) B,   h_k = C A^k B,   k = 0 .. 2 n - 1
 
-The first 2 n of these numbers determine the transfer function of n states, so parameters are locally known
-from input and outputs where the derivatives of `h_k` by the parameters have full rank. The numbers are
-fractions with derivatives beside them, so a rank is a rank and not a tolerance.
+The first 2 n Markov parameters h_k determine the transfer function of n states. So parameters are locally
+identifiable from input and outputs if the derivatives of `h_k` by the parameters have full rank. All numbers
+are fractions with exact derivatives, so that the rank does not depend on a tolerance.
 
 Source: M. S. Grewal and K. Glover, IEEE Trans. Autom. Control 21, 1976; numbers drawn at random give the
 rank that holds almost everywhere: A. Sedoglavic, J. Symb. Comput. 33, 2002.
@@ -25,22 +25,22 @@ from rotflex_jax.mechanism import Mechanism
 from rotflex_jax.mechanism.assembly import second_order_matrices
 from rotflex_jax.parameters import HALF_WIDTH_95
 
-# Entries below this share of the largest belong to no sentence.
+# Parameters with a smaller share than this of the largest are left out of a sentence.
 LEAST_SHARE = 0.1
-# Entries of a vector below this are zero, and two vectors are the same where no entry differs by more than
-# this: those of random runs are known to fewer digits than exact ones.
+# Entries of a vector below the first are zero. Two vectors are the same if no entry differs by more than the
+# second, since vectors from random runs have fewer correct digits than exact ones.
 ZERO, SAME = 1e-6, 1e-4
 
 
 @dataclasses.dataclass(frozen=True)
 class Direction:
-    """A way in which parameters move together, and how far the outputs let them.
+    """A direction in which parameters change together without, or nearly without, a change of the outputs.
 
     Attributes:
-        shares: Parameter -> how much of its own size it moves; the largest is 1.
-        kind: `powers` where the shares hold at any values, so that a product of powers is known; `sum` where
-            the amounts do, so that a sum is known; `mixed` otherwise.
-        std: Standard deviation along it as a share of the values; infinite where nothing is known.
+        shares: Parameter -> its relative change; the largest is 1.
+        kind: `powers` if the relative changes are the same for all parameter values, so that products of
+            powers are known; `sum` if the absolute changes are, so that a sum is known; `mixed` otherwise.
+        std: Standard deviation along the direction as a share of the values; infinite if nothing is known.
     """
 
     shares: dict[str, float]
@@ -49,13 +49,13 @@ class Direction:
 
     @property
     def parameters(self) -> tuple[str, ...]:
-        """Those that it moves by a noticeable share."""
+        """Parameters with a noticeable share; all of them if the direction is unknown."""
         least = 0.0 if np.isinf(self.std) else LEAST_SHARE
         return tuple(n for n, v in self.shares.items() if abs(v) >= least)
 
     @property
     def sentence(self) -> str:
-        """What is known, in words."""
+        """What is known along the direction, in words."""
         names, v = self.parameters, self.shares
         half = f"{100 * HALF_WIDTH_95 * self.std:.2g}"
         wide = "" if np.isinf(self.std) else f" (together known to ± {half} % only)"
@@ -93,13 +93,13 @@ def kind_of(
     values: Float[np.ndarray, " P"],
     other: Float[np.ndarray, " P"],
 ) -> str:
-    """Whether a direction is the same in shares or in amounts at two places.
+    """Kind of a direction: whether its relative or its absolute changes agree at two sets of values.
 
     Args:
-        log: In shares of the values, at the first place.
-        again: At the other.
-        values: Of the parameters at the first.
-        other: At the other.
+        log: Relative changes at the first set of values.
+        again: Relative changes at the second set.
+        values: Parameter values of the first set.
+        other: Parameter values of the second set.
     """
     if _same(log, again):
         return "powers"
@@ -112,7 +112,7 @@ def _same(a: np.ndarray, b: np.ndarray) -> bool:
 
 
 def reduced(vectors: Float[np.ndarray, "K P"]) -> Float[np.ndarray, "K P"]:
-    """Another basis of the space of some vectors, each with few entries and a column of its own."""
+    """Another basis of the span of some vectors, each with few entries and a column of its own."""
     left = np.array(vectors, float)
     for k in range(len(left)):
         rest = np.abs(left[k:])
@@ -128,7 +128,7 @@ def reduced(vectors: Float[np.ndarray, "K P"]) -> Float[np.ndarray, "K P"]:
 def direction(
     names: Sequence[str], vector: Float[np.ndarray, " P"], kind: str, std: float = np.inf
 ) -> Direction:
-    """A direction with its largest share 1."""
+    """A direction, scaled so that its largest share is 1."""
     scaled = vector / vector[np.argmax(np.abs(vector))]
     return Direction(
         {n: float(v) for n, v in zip(names, scaled, strict=True) if abs(v) > ZERO}, kind, float(std)
@@ -138,12 +138,12 @@ def direction(
 def least_held(
     names: Sequence[str], vectors: Float[np.ndarray, "K P"], most: int = 400
 ) -> tuple[tuple[str, ...], ...]:
-    """Sets of as few parameters as possible that free all others when they are held.
+    """The smallest sets of parameters that make all others identifiable if they are held.
 
     Args:
-        names: Of the parameters.
-        vectors: What nothing determines.
-        most: How many sets are looked at.
+        names: Names of the parameters.
+        vectors: Directions that are unknown.
+        most: Largest number of sets that are examined.
     """
     K = len(vectors)
     if not K:
@@ -162,7 +162,7 @@ Matrix = list[list[Any]]
 
 @dataclasses.dataclass(frozen=True)
 class Dual:
-    """A fraction with its derivatives along some directions.
+    """A fraction with its exact derivatives along some directions.
 
     >>> x = Dual(Fraction(3), (Fraction(1),))
     >>> (2 / x + x * x).slopes[0] == Fraction(-2, 9) + 6
@@ -212,7 +212,7 @@ class Dual:
 
 
 def exact(x: Any) -> Fraction:
-    """A number as the fraction that its decimals say.
+    """A number as the fraction given by its decimals.
 
     >>> exact(0.0059)
     Fraction(59, 10000)
@@ -226,7 +226,7 @@ def is_linear(m: Mechanism) -> bool:
 
 
 def random_values(m: Mechanism, free: Sequence[str], seed: int) -> dict[str, Fraction]:
-    """Values of all parameters: free ones at random, positive; trusted ones as they are."""
+    """Values of all parameters: random positive values for free ones, the given values for others."""
     draw = random.Random(seed)
     return {
         name: Fraction(draw.randint(11, 99), draw.randint(11, 99)) if name in free else exact(value)
@@ -237,12 +237,12 @@ def random_values(m: Mechanism, free: Sequence[str], seed: int) -> dict[str, Fra
 def impulse_slopes(
     m: Mechanism, values: Mapping[str, Fraction], free: Sequence[str], rows: Sequence[Sequence[float]]
 ) -> Matrix:
-    """Derivatives of `h_k` of some readings by the logarithms of parameters.
+    """Derivatives of the Markov parameters `h_k` of some readings by the logarithms of parameters.
 
     Args:
         m: A linear machine.
-        values: Of all parameters.
-        free: By which parameters.
+        values: Values of all parameters.
+        free: Parameters by which derivatives are taken.
         rows: Readings as coefficients of positions and speeds.
 
     Returns:
@@ -271,7 +271,7 @@ def impulse_slopes(
 
 
 def _state_space(m: Mechanism, effects: Sequence[Any], none: Dual) -> tuple[Matrix, list[Dual]]:
-    """`A` and `B` of positions, speeds and the states of linear effects, as `mechanism.assembly` has them."""
+    """`A` and `B` for positions, speeds and the states of linear effects, as in `mechanism.assembly`."""
     n = len(m.coordinates)
     empty = lambda rows, columns: [[none] * columns for _ in range(rows)]  # noqa: E731
     stamps = [(e.stamp(), [exact(x) for x in m.vector(e)]) for e in effects]
@@ -307,7 +307,7 @@ def _dot(a: Sequence[Any], b: Sequence[Any], none: Dual) -> Dual:
 
 
 def _inverse(M: Matrix, none: Dual) -> Matrix:
-    """Inverse of a matrix of duals by elimination."""
+    """Inverse of a matrix of dual numbers, by elimination."""
     n = len(M)
     rows = [[*row, *(none + int(i == j) for j in range(n))] for i, row in enumerate(M)]
     for k in range(n):
@@ -322,7 +322,7 @@ def _inverse(M: Matrix, none: Dual) -> Matrix:
 
 
 def null_space(rows: Matrix, size: int) -> list[list[Fraction]]:
-    """Vectors that a matrix of fractions maps to zero, each with a one in a column of its own.
+    """Basis of the null space of a matrix of fractions; each vector has a one in a column of its own.
 
     >>> null_space([[Fraction(1), Fraction(1), Fraction(0)]], 3)
     [[Fraction(-1, 1), Fraction(1, 1), Fraction(0, 1)], [Fraction(0, 1), Fraction(0, 1), Fraction(1, 1)]]

@@ -1,4 +1,4 @@
-"""Ready-made mechanisms: joints of the paper and the maker, a link, an inertia, servos, machines; MJCF."""
+"""Ready-made mechanisms: flexible joints, a flexible link, servos, public machines; import from MJCF."""
 
 from rotflex_jax.joints.flexible_link import flexible_link
 from rotflex_jax.joints.mjcf import load_mjcf

@@ -26,7 +26,7 @@ JOINTS = (
 
 
 def choose(name: str, choices: Iterable[str], what: str) -> str:
-    """`name` if it is one of the choices; otherwise a sentence with the likely one."""
+    """`name` if it is one of the choices; otherwise an `InputError` that suggests the closest choice."""
     choices = list(choices)
     if name in choices:
         return name
@@ -36,12 +36,12 @@ def choose(name: str, choices: Iterable[str], what: str) -> str:
 
 
 def joint(text: str) -> Any:
-    """The mechanism meant by `paper`, by `quanser_2010:spring=3,hub_anchor=A`, or as for `model`."""
+    """The mechanism of `paper`, of `quanser_2010:spring=3,hub_anchor=A`, or of other texts for `model`."""
     return model(text).mechanism
 
 
 def model(text: str, add: Iterable[str] = ()) -> Any:
-    """The model meant by a joint, `FILE.py:NAME`, `FILE.xml:joint=NAME` or `MODEL.json`, and effects."""
+    """The model of a joint, `FILE.py:NAME`, `FILE.xml:joint=NAME` or `MODEL.json`, with effects added."""
     found = _model(text)
     for each in add:
         found = found + effect(each)
@@ -59,22 +59,22 @@ def _model(text: str) -> Any:
     if text.endswith(".json") or (separator and "=" not in values and name not in JOINTS):
         return named(text)
     preset = getattr(joints, choose(name, JOINTS, "joint"))
-    # A motor or a servo is not a number; whoever needs another one writes Python.
+    # A motor or a servo is not a number: another one has to be given in Python.
     names = [key for key in inspect.signature(preset).parameters if key not in ("motor", "servo")]
     return Model(preset(**_numbers(values, names, f"option of {name}")))
 
 
 def named(text: str) -> Any:
-    """The model meant by `plant.py:turntable`, `package.module:turntable` or `model.json`.
+    """The model of `plant.py:turntable`, `package.module:turntable` or `model.json`.
 
-    What the file registers (effects of one's own) is known from then on.
+    The file may register effects of its own, which are then in the catalogue.
 
     Args:
         text: A Python file or module with the name of a `Mechanism`, of a `Model` or of a function that
             returns one; or a file that `model.save` has written.
 
     Raises:
-        InputError: No such file, module or name, or something else than a mechanism behind it.
+        InputError: The file, module or name does not exist, or the name is no mechanism and no model.
     """
     from rotflex_jax.mechanism import Mechanism
     from rotflex_jax.models.model import Model
@@ -97,7 +97,7 @@ def named(text: str) -> Any:
 
 
 def imported(place: str) -> ModuleType:
-    """The Python file or module, run once."""
+    """The Python file or module, imported once."""
     try:
         if not place.endswith(".py"):
             here = str(Path.cwd())
@@ -132,9 +132,9 @@ def imported(place: str) -> ModuleType:
 
 
 def effect(text: str) -> Any:
-    """The effect meant by `coulomb@hub`, or by `coulomb@hub:level=0.03`.
+    """The effect of `coulomb@hub`, or of `coulomb@hub:level=0.03`.
 
-    A signal stands behind its port, before the values: `measured_disturbance@arm: wind [N]:gain=0.1`.
+    A signal comes after its port and before the values: `measured_disturbance@arm: wind [N]:gain=0.1`.
     """
     from rotflex_jax.effects import CATALOG
     from rotflex_jax.effects.base import driven_place
@@ -158,7 +158,7 @@ def effect(text: str) -> Any:
 
 
 def _numbers(text: str, names: Iterable[str], what: str) -> dict[str, Any]:
-    """`a=1,b=C` as a dict; what does not read as a number stays text."""
+    """`a=1,b=C` as a dict; a value that is no number stays text."""
     found: dict[str, Any] = {}
     for pair in filter(None, text.split(",")):
         key, separator, value = (part.strip() for part in pair.partition("="))

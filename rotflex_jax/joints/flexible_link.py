@@ -1,9 +1,9 @@
-"""A rotary flexible link: a servo turns a hub, a beam clamped to it bends, a strain gauge shows how much.
+"""A rotary flexible link: a servo turns a hub with a clamped beam, and a strain gauge measures its bending.
 
-A clamped beam acts on the hub like separate inertias on springs, one for each mode: of the moment of inertia
-of a uniform beam `12 / (beta L)^4` belongs to a mode, 97.07 % to the first and 2.47 % to the second. The
-deflection of each is an angle `eta` of that inertia against the hub. The curvature of the beam at the clamp
-is `4 / L` times the sum of these angles, whatever the mode.
+A clamped beam acts on the hub like separate inertias on springs, one for each mode. A share of
+`12 / (beta L)^4` of the moment of inertia of a uniform beam belongs to a mode: 97.07 % to the first and
+2.47 % to the second. The deflection of a mode is an angle `eta` of its inertia relative to the hub. The
+curvature of the beam at the clamp is `4 / L` times the sum of these angles, whatever the mode.
 """
 
 import math
@@ -14,10 +14,10 @@ from rotflex_jax.mechanism import Mechanism
 
 # Roots of cosh(b) cos(b) = -1: b is the wave number of a clamped beam times its length.
 WAVE_NUMBERS = (1.8751040687, 4.6940911330)
-# Part of the beam's moment of inertia about the clamp that belongs to each mode.
+# Share of the beam's moment of inertia about the clamp that belongs to each mode.
 SHARES = tuple(12 / b**4 for b in WAVE_NUMBERS)
-# A gauge that is calibrated by the tip under a load there shows tip / L: 3/4 of what its strain shows
-# of the modes, since a beam under a load at its tip has the strain 3 tip / L^2 at the clamp.
+# A gauge that was calibrated with a load at the tip reads tip / L where the curvature at the clamp is
+# 3 tip / L^2. The modes have the curvature 4 / L times the sum of their angles, so it reads 4/3 of this sum.
 GAUGE_GAIN = 4 / 3
 
 PORTS = {
@@ -41,33 +41,33 @@ def flexible_link(
     gauge_gain: float = GAUGE_GAIN,
     motor: Motor | None = None,
 ) -> Mechanism:
-    """A beam on a servo with its first two modes; `alpha` is what a strain gauge at the clamp shows.
+    """A beam on a servo with its first two modes; `alpha` is the reading of a strain gauge at the clamp.
 
         J theta'' + J_1 (theta'' + eta_1'') + J_2 (theta'' + eta_2'') = motor - hub_damping theta'
         J_i (theta'' + eta_i'') = -k_i eta_i - d_i eta_i',   alpha = gain (eta_1 + eta_2)
 
-    Searches try effects at `hub`, `joint` (the first mode) and `arm`. Trusted are the inertias of both
-    modes and of the motor everything but its torque constant. Free are hub inertia, stiffnesses, dampers,
-    the torque constant and the gain of the gauge (`alpha.sensor_gain.error`, gain less one). Not for a tip
-    that carries a load: it changes the shares of the modes.
+    Searches try effects at `hub`, `joint` (the first mode) and `arm`. The inertias of both modes are trusted,
+    and all parameters of the motor except its torque constant. The hub inertia, the stiffnesses, the dampers,
+    the torque constant and the gain of the gauge (`alpha.sensor_gain.error`, the gain less one) are free. Not
+    for a tip that carries a load, which changes the shares of the modes.
 
     Args:
-        mass: Of the beam [kg].
-        length: From the axis of the hub to the tip [m].
-        frequency: Of the first mode while the hub is held [Hz]; the second is 6.27 times as high.
-        damping_ratio: Of both modes.
-        hub: Inertia of the servo as the hub feels it [kg m^2]; None for the SRV02's.
-        hub_damping: Viscous damping beside the motor's own [N m s/rad].
-        gauge_gain: Reading of the gauge over the sum of the modes' angles; 4/3 where the gauge was calibrated
-            with the tip as `deflection / length`.
-        motor: Motor with its gear; None for the SRV02's.
+        mass: Mass of the beam [kg].
+        length: Distance from the axis of the hub to the tip [m].
+        frequency: Frequency of the first mode while the hub is held [Hz]; the second is 6.27 times as high.
+        damping_ratio: Damping ratio of both modes.
+        hub: Inertia of the servo, reflected to the hub [kg m^2]; None for the SRV02.
+        hub_damping: Viscous damping in addition to that of the motor [N m s/rad].
+        gauge_gain: Reading of the gauge divided by the sum of the modes' angles; 4/3 if the gauge was
+            calibrated by the deflection of the tip, as `deflection / length`.
+        motor: Motor with its gear; None for the SRV02.
 
     Returns:
         Mechanism with the outputs `theta` and `alpha`.
 
     Source: L. Meirovitch, Fundamentals of Vibrations, 2001, section 8.3 (clamped beam); Quanser, Rotary
-        Flexible Link, user manual, 2011 (mass, length, calibration of the gauge). The frequency is a usual
-        one for that link.
+        Flexible Link, user manual, 2011 (mass, length, calibration of the gauge). The frequency is typical of
+        that link.
 
     >>> link = flexible_link()
     >>> link.channels, "alpha.sensor_gain.error" in link.free_names
@@ -77,7 +77,7 @@ def flexible_link(
     inertias = [share * whole for share in SHARES]
     angular = [2 * math.pi * frequency * (b / WAVE_NUMBERS[0]) ** 2 for b in WAVE_NUMBERS]
     motor = motor or srv02_motor()
-    # Modes above the second follow the hub.
+    # The inertia of modes above the second moves with the hub.
     own = (hub_inertia(body=0.0) if hub is None else hub) + whole - sum(inertias)
     modes = []
     for at, carried, J, W in zip(("joint", "second"), ("arm", "second_arm"), inertias, angular, strict=True):

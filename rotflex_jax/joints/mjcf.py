@@ -1,4 +1,4 @@
-"""A mechanism from one joint of an MJCF file, with or without a joint behind it."""
+"""A mechanism from one joint of an MJCF file, with or without a child joint."""
 
 import math
 import os
@@ -29,7 +29,7 @@ from rotflex_jax.mechanism.quantity import Units
 from rotflex_jax.text.numbers import one_line
 
 IGNORABLE = ("forcerange", "ctrlrange", "ref", "springref", "tendon", "equality", "actuator")
-"""What a file may say that can be left out on request."""
+"""Entries of a file that can be left out on request."""
 
 
 def load_mjcf(
@@ -38,31 +38,32 @@ def load_mjcf(
     child: str | None = None,
     ignore: Iterable[str] = (),
 ) -> Mechanism:
-    """A mechanism from one joint of an MJCF file, as a start of a fit or a search.
+    """A mechanism from one joint of an MJCF file, as the start of a fit or a search.
 
         (armature + inertia about the axis) q''
             = actuator - damping q' - frictionloss sign(q') - stiffness q - weight
 
-    All that hangs on the joint is rigid at rest. With `child`, a joint about the same axis behind it, the two
-    are a flexible joint of hub and arm. Inertias come from `<inertial>` or from simple shapes,
-    attributes from classes of defaults; the actuator is a `motor`, `general`, `position`, `velocity` or
-    `dcmotor`, its control the input. Ranges of joints and of goals, contacts and drawings are not read.
-    MuJoCo itself is not needed. Not for a chain whose inertia depends on the angle of the child.
+    All bodies below the joint count as one rigid body in the position at rest. With `child`, a joint below it
+    about the same axis, the two joints are the hub and the arm of a flexible joint. Inertias come from
+    `<inertial>` or from simple shapes, attributes also from classes of defaults. The actuator is a `motor`,
+    `general`, `position`, `velocity` or `dcmotor`; its control is the input. Ranges of joints and of goals,
+    contacts and drawings are not read. MuJoCo itself is not needed. Not for a chain whose inertia depends on
+    the angle of the child.
 
     Args:
-        path: Of the file.
-        joint: Name of the joint; None where the file has only one.
-        child: Name of the joint behind it, for a flexible joint.
-        ignore: What is left out where the file says it: `forcerange`, `ctrlrange`, `ref`, `springref`,
+        path: Path of the file.
+        joint: Name of the joint; None if the file has only one joint.
+        child: Name of the joint below it, for a flexible joint.
+        ignore: Entries of the file that are left out: `forcerange`, `ctrlrange`, `ref`, `springref`,
             `tendon`, `equality`, `actuator`.
 
     Returns:
-        Mechanism with the port `hub` and the output `theta`, with a child `joint`, `arm` and `alpha` too; of
-        a sliding joint the port `axis` and the output `position`.
+        Mechanism with the port `hub` and the output `theta`; with a child also `joint`, `arm` and `alpha`.
+        For a sliding joint the port `axis` and the output `position` take the place of `hub` and `theta`.
 
     Raises:
-        InputError: No such joint; what the file says and no effect can, by name; a file that declares a
-            document type, includes others or is too large.
+        InputError: The joint does not exist, the file has an entry that no effect can represent (the message
+            names it), or the file declares a document type, includes other files or is too large.
 
     Source: MuJoCo documentation, XML reference, body, inertial, joint, actuator.
     """
@@ -71,7 +72,7 @@ def load_mjcf(
     return mechanism_of(path, joint, child, left_out)
 
 
-# Torque constant of a servo whose joint has no damping: its back-EMF is as good as none [N m/A].
+# Torque constant of a servo whose joint has no damping; its back-EMF is negligible [N m/A].
 _NO_BRAKE = 1e-4
 
 # Attributes that every kind of actuator has.
@@ -81,7 +82,7 @@ _OF_ALL_KINDS = {"gear", "ctrlrange", "ctrllimited", "forcerange", "forcelimited
 def mechanism_of(
     path: str | os.PathLike[str], joint: str | None, child: str | None, ignore: tuple[str, ...]
 ) -> Mechanism:
-    """The mechanism of a joint and of the one behind it; arguments as of `load_mjcf`."""
+    """The mechanism of a joint and its child; arguments as in `load_mjcf`."""
     file = FileModel(path)
     hub = _named(file, joint, "joint")
     arm = None if child is None else _named(file, child, "child")
@@ -102,7 +103,7 @@ def _named(file: FileModel, name: str | None, argument: str) -> FileJoint:
 
 
 class _Reader:
-    """From the joints of a file to effects."""
+    """Translates the joints of a file to effects."""
 
     def __init__(
         self, file: FileModel, hub: FileJoint, arm: FileJoint | None, ignore: tuple[str, ...]
@@ -116,7 +117,7 @@ class _Reader:
             self._check_child(arm)
 
     def unable(self, what: str, name: str) -> None:
-        """Refuse what no effect says, unless it is to be left out."""
+        """Refuse an entry that no effect can represent, unless it is to be left out."""
         if name not in self.ignore:
             hint = f", or give ignore=[{name!r}] to leave it out" if name in IGNORABLE else ""
             raise InputError(
@@ -167,7 +168,7 @@ class _Reader:
         return self._assembled()
 
     def _check_masses(self, joint: FileJoint, bodies: list[int]) -> None:
-        """Refuse bodies without mass or inertia, which any torque would move at once, as MuJoCo does."""
+        """Refuse bodies without mass or inertia, as MuJoCo does: any torque would move them at once."""
         if not sum(self.file.bodies[k].mass for k in bodies) > 0 or not self._inertia(bodies) > 0:
             raise InputError(
                 f"{one_line(self.file.path)} has no mass, or no inertia about the axis, in what moves "
@@ -175,7 +176,7 @@ class _Reader:
             )
 
     def _check_options(self) -> None:
-        """Options that change the forces of the whole file."""
+        """Refuse options that change the forces of the whole file."""
         for name in ("actuation", "damper", "spring", "passive", "frictionloss", "clampctrl"):
             if self.file.flags.get(name) == "disable":
                 self.unable(f'the flag {name}="disable"', name)
@@ -206,7 +207,7 @@ class _Reader:
     # -- what moves --------------------------------------------------------------------------------
 
     def _inertia(self, bodies: list[int]) -> float:
-        """About the axis of the joint [kg m^2], or the mass of what slides [kg]."""
+        """Inertia of bodies about the axis of the joint [kg m^2], or for a sliding joint their mass [kg]."""
         total, axis = 0.0, self.hub.axis
         for b in (self.file.bodies[k] for k in bodies):
             across = np.cross(axis, b.centre - self.hub.anchor)
@@ -214,7 +215,7 @@ class _Reader:
         return total
 
     def _weight(self, bodies: list[int], port: str) -> None:
-        """tau(q) = axis . (turn(q) r x m g): a cosine and a sine of the angle."""
+        """Torque of the weight, axis . (turn(q) r x m g): a cosine and a sine of the angle."""
         told = self.file.options
         if self.file.flags.get("gravity") == "disable":
             return
@@ -233,7 +234,7 @@ class _Reader:
     # -- joints ------------------------------------------------------------------------------------
 
     def _own_damping(self, joint: FileJoint) -> float:
-        """Damping of a joint, which says nothing that no effect has."""
+        """Damping of a joint; refuses entries of the joint that no effect can represent."""
         for name in ("springdamper", "springyield", "actuatorgravcomp"):
             if any(x not in ("0", "0.0", "false") for x in joint.told.get(name, "0").split()):
                 self.unable(f"{name} at the joint {one_line(joint.name)!r}", name)
@@ -252,7 +253,7 @@ class _Reader:
         self._join(Coulomb(at=port, level=level), bool(level))
 
     def _join(self, effect: Effect, wanted: bool) -> None:
-        """Add an effect, to the one of its kind at its port where there is one."""
+        """Add an effect; if there is one of its name at its port, add the parameters to that effect."""
         if not wanted:
             return
         for k, old in enumerate(self.effects):
@@ -262,7 +263,7 @@ class _Reader:
         self.effects.append(effect)
 
     def _tendons(self) -> None:
-        """Fixed tendons over hub and arm act on the arm; others that touch the joints are refused."""
+        """Enter fixed tendons over hub and arm at the arm; refuse other tendons that act on the joints."""
         names = {j.name for j in (self.hub, self.arm) if j is not None}
         for group in self.file.root.findall("tendon"):
             for element in group:
@@ -298,7 +299,7 @@ class _Reader:
     # -- the actuator ------------------------------------------------------------------------------
 
     def _drive(self, damping: float) -> float:
-        """Adds what drives the joint; returns the damping that is left beside it."""
+        """Adds the drive of the joint; returns the damping of the joint that the drive does not include."""
         mine: list[ET.Element] = []
         names = {j.name for j in (self.hub, self.arm) if j is not None}
         fixed = self.file.root.findall("tendon/fixed")
@@ -325,7 +326,7 @@ class _Reader:
     def _actuator(self, element: ET.Element, damping: float) -> float:
         file, kind = self.file, element.tag
         known = ("motor", "general", "position", "velocity", "dcmotor")
-        # MuJoCo keeps one set of defaults for all actuators; gains are those of the kind.
+        # MuJoCo keeps one set of defaults for all actuators; gains belong to one kind of actuator.
         every = file.told(element, None, *known)
         told = file.told(element, None, "general") | {n: every[n] for n in _OF_ALL_KINDS & set(every)}
         if kind == "general" and {"kp", "kv"} & set(every):
@@ -369,7 +370,7 @@ class _Reader:
         return torque
 
     def _law(self, kind: str, told: dict[str, str]) -> tuple[float, float, float, float, float]:
-        """Gain, constant, share of position and of speed, time constant of an actuator's force."""
+        """Gain, constant, coefficients of position and speed, and time constant of an actuator's force."""
         file = self.file
         if kind == "position":
             stiffness = file.number(told, "kp", 1.0)
@@ -399,7 +400,7 @@ class _Reader:
             self.effects.append(Lag(time=time))
 
     def _range(self, told: dict[str, str], name: str) -> float:
-        """Half of a symmetric range; infinite where there is none, or where it is left out."""
+        """Half of a symmetric range; infinite if there is no range, or if it is left out."""
         ends = self.file.numbers(told, name, 2)
         if ends is None or told.get(name.replace("range", "limited"), "auto") == "false":
             return math.inf
@@ -409,7 +410,7 @@ class _Reader:
         return float(ends[1]) if name not in self.ignore else math.inf
 
     def _limits(self, told: dict[str, str], gain: float, other: bool) -> None:
-        """Limits of control and force as one limit of the input, from which no `other` force may differ."""
+        """Enter the limits of control and force as one limit of the input; refuse one of an `other` force."""
         limit, force = self._range(told, "ctrlrange"), self._range(told, "forcerange")
         if math.isfinite(force) and other:
             self.unable(
@@ -423,7 +424,7 @@ class _Reader:
     def _position_loop(
         self, told: dict[str, str], gear: float, torque: float, stiffness: float, brake: float, damping: float
     ) -> float:
-        """A position loop: linear, or where its force is limited a servo that has the joint's damping."""
+        """A position loop: linear, or a servo that includes the joint's damping if its force is limited."""
         if stiffness < 0 or torque <= 0:
             self.unable("an actuator that pushes away from its goal", "actuator law")
         self.input_unit = "m" if self.hub.slides else "rad"

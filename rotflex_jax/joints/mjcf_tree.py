@@ -1,4 +1,4 @@
-"""What an MJCF file says of its bodies and joints at rest: read safely, with classes of defaults resolved."""
+"""Bodies and joints of an MJCF file at rest, read safely and with classes of defaults resolved."""
 
 import dataclasses
 import math
@@ -16,22 +16,22 @@ from rotflex_jax.text.files import path_of
 from rotflex_jax.text.numbers import one_line
 
 LARGEST_FILE = 10_000_000
-"""Size of an MJCF file beyond which it is none [bytes]."""
+"""Largest size of a file that is read as MJCF [bytes]."""
 
 DEEPEST = 200
-"""Elements inside one another in a file."""
+"""Largest depth of nested elements in a file."""
 
-# They change the file or its bodies before anything is read.
+# Elements that change the file or its bodies before anything is read.
 _UNREAD = ("include", "attach", "replicate", "frame", "composite", "flexcomp", "model")
 
 LARGEST_NUMBER = 1e12
-"""Numbers beyond it are no masses, sizes or torques of a machine."""
+"""Limit of numbers; larger ones are no masses, sizes or torques of a machine."""
 
 SMALLEST = 1e-9
-"""Sizes of shapes below it are none [m]."""
+"""Smallest size of a shape [m]."""
 
 WATER = 1000.0
-"""Density of a shape that says none [kg/m^3]."""
+"""Density of a shape without a given density [kg/m^3]."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,12 +39,12 @@ class FileJoint:
     """A joint at rest, in the frame of the world.
 
     Attributes:
-        name: Of the joint.
+        name: Name of the joint.
         body: Number of its body.
-        slides: Whether it slides; it turns otherwise.
-        axis: Unit vector.
-        anchor: A point of the axis [m].
-        told: Its attributes, those of its class among them.
+        slides: Whether the joint slides; otherwise it turns.
+        axis: Unit vector of the axis.
+        anchor: A point on the axis [m].
+        told: Attributes of the joint, including those of its class.
     """
 
     name: str
@@ -60,11 +60,11 @@ class FileBody:
     """A body at rest, in the frame of the world.
 
     Attributes:
-        name: Of the body.
+        name: Name of the body.
         parent: Number of its parent; -1 for the world.
-        mass: [kg].
-        centre: Of its mass [m].
-        inertia: About that [kg m^2].
+        mass: Mass [kg].
+        centre: Centre of mass [m].
+        inertia: Inertia about the centre of mass [kg m^2].
     """
 
     name: str
@@ -78,10 +78,10 @@ class FileModel:
     """An MJCF file.
 
     Args:
-        path: Of the file.
+        path: Path of the file.
 
     Raises:
-        InputError: It cannot be read, is no MJCF, or holds what this reader does not know.
+        InputError: The file cannot be read, is no MJCF, or has elements that this reader does not support.
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
@@ -127,7 +127,7 @@ class FileModel:
                 self._read_body(element, -1, np.zeros(3), np.eye(3), world.get("childclass"))
 
     def error(self, what: str, instead: str) -> InputError:
-        """A sentence on this file."""
+        """An error with a sentence on this file."""
         return InputError(f"{one_line(self.path)} {what}, which cannot be read; {instead}.")
 
     # -- attributes --------------------------------------------------------------------------------
@@ -153,10 +153,10 @@ class FileModel:
         return found | element.attrib
 
     def numbers(self, told: dict[str, str], name: str, count: int | None, default: Any = None) -> Any:
-        """Numbers of an attribute; the default where it lacks.
+        """Numbers of an attribute; the default if the attribute is missing.
 
         Raises:
-            InputError: Something else than that many finite numbers.
+            InputError: The attribute is not `count` finite numbers.
         """
         if name not in told:
             return default
@@ -174,12 +174,12 @@ class FileModel:
         return found
 
     def number(self, told: dict[str, str], name: str, default: float = 0.0) -> float:
-        """One number of an attribute."""
+        """An attribute that is one number."""
         found = self.numbers(told, name, 1)
         return default if found is None else float(found[0])
 
     def _turn(self, told: dict[str, str]) -> np.ndarray:
-        """The matrix of the orientation that an element has."""
+        """Rotation matrix of the orientation of an element."""
         unit = math.pi / 180 if self.degrees else 1.0
         if "quat" in told:
             w, *xyz = self.numbers(told, "quat", 4)
@@ -194,7 +194,7 @@ class FileModel:
                 raise self.error(f'has eulerseq="{one_line(sequence)[:20]}"', "write three of x, y, z")
             for letter, angle in zip(sequence, self.numbers(told, "euler", 3), strict=True):
                 one = _turned(np.eye(3)["xyz".index(letter.lower())], angle * unit)
-                # Small letters are axes that turn with the body.
+                # Lower-case letters are axes that turn with the body.
                 matrix = matrix @ one if letter.islower() else one @ matrix
             return matrix
         if "xyaxes" in told:
@@ -225,7 +225,7 @@ class FileModel:
             own = self.told(joint, childclass)
             kind = own.get("type", "hinge")
             if kind not in ("hinge", "slide"):
-                continue  # moves in more than one way: no machine of one joint, and named by nobody
+                continue  # has several degrees of freedom, so it cannot be chosen
             axis = self.numbers(own, "axis", 3, np.array([0.0, 0.0, 1.0]))
             if not np.linalg.norm(axis) > SMALLEST:
                 raise self.error(
@@ -240,7 +240,7 @@ class FileModel:
             self._read_body(child, number, at, turn, childclass)
 
     def _mass(self, body: ET.Element, childclass: str | None) -> tuple[float, np.ndarray, np.ndarray]:
-        """Mass, centre and inertia of a body, in its frame."""
+        """Mass, centre of mass and inertia of a body, in its frame."""
         inertial, mode = body.find("inertial"), self.settings.get("inertiafromgeom", "auto")
         if inertial is not None and mode != "true":
             told = dict(inertial.attrib)
@@ -294,7 +294,7 @@ class FileModel:
             yield mass, place, turn @ np.diag(mass * per_mass) @ turn.T
 
     def _solid(self, kind: str, size: np.ndarray) -> tuple[float, np.ndarray]:
-        """Volume, and moments of inertia per mass."""
+        """Volume of a shape, and its moments of inertia per mass."""
         need = {"sphere": 1, "capsule": 2, "cylinder": 2, "box": 3, "ellipsoid": 3}
         if kind not in need or len(size) < need[kind] or not (size[: need[kind]] > SMALLEST).all():
             what = f"has a shape of type {one_line(kind)!r} that counts towards a mass"
@@ -317,7 +317,7 @@ class FileModel:
         return tube + ball, np.array([across, across, along]) / (tube + ball)
 
     def below(self, body: int) -> list[int]:
-        """A body and all that hang on it."""
+        """A body and all its descendants."""
         found = {body}
         for k in range(body + 1, len(self.bodies)):
             if self.bodies[k].parent in found:
@@ -332,7 +332,7 @@ def _parsed(path: str | os.PathLike[str]) -> ET.Element:
     try:
         size = place.stat().st_size
         data = place.read_bytes() if size <= LARGEST_FILE else b""
-    except (OSError, ValueError) as error:  # a name with a zero byte is no name of a file
+    except (OSError, ValueError) as error:  # a file name cannot have a zero byte
         reason = getattr(error, "strerror", None) or error
         raise InputError(f"{shown} cannot be read ({reason}); give the path of an MJCF file.") from error
     if size > LARGEST_FILE:
@@ -368,7 +368,7 @@ def _parsed(path: str | os.PathLike[str]) -> ET.Element:
         return builder.close()
     except InputError:
         raise
-    except (expat.ExpatError, LookupError, ValueError) as error:  # the latter two: an encoding that it lacks
+    except (expat.ExpatError, LookupError, ValueError) as error:  # the latter two: an unknown encoding
         raise InputError(f"{shown} is no XML ({error}); give the path of an MJCF file.") from error
 
 
@@ -378,14 +378,14 @@ def _unit(vector: np.ndarray) -> np.ndarray:
 
 
 def _turned(axis: np.ndarray, angle: float) -> np.ndarray:
-    """Matrix of a turn about an axis (Rodrigues)."""
+    """Rotation matrix for an axis and an angle (Rodrigues)."""
     x, y, z = _unit(axis)
     across = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     return np.eye(3) + math.sin(angle) * across + (1 - math.cos(angle)) * across @ across
 
 
 def _turn_to(direction: np.ndarray) -> np.ndarray:
-    """Matrix of the turn that takes z into a direction by the shortest way."""
+    """Rotation matrix that turns the z axis into a direction by the smallest angle."""
     z = _unit(direction)
     axis = np.cross([0.0, 0.0, 1.0], z)
     sine = float(np.linalg.norm(axis))

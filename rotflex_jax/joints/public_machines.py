@@ -20,23 +20,23 @@ def single_inertia(
     channel: str = "theta",
     port: str = "hub",
 ) -> Mechanism:
-    """A single inertia with a motor and viscous damping, one output.
+    """A single inertia with a motor, viscous damping and one output.
 
         inertia theta'' = motor - damping theta'
 
-    The motor is trusted as a whole, inertia and damping are free. A linear axis obeys the same
+    All parameters of the motor are trusted; inertia and damping are free. A linear axis obeys the same
     equation: read kg for kg m^2, N for N m and m for rad, and give its force per volt as the torque
     constant of a motor with `back_emf=0, resistance=1, gear_ratio=1`.
 
     Args:
-        inertia: [kg m^2].
-        motor: Motor with its gear; None for the SRV02's as the paper lists it.
-        damping: Viscous damping beside the motor's own [N m s/rad].
+        inertia: Inertia [kg m^2].
+        motor: Motor with its gear; None for the motor of the SRV02 as listed in the paper.
+        damping: Viscous damping in addition to that of the motor [N m s/rad].
         channel: Name of the output.
         port: Name of the port.
 
     Returns:
-        Mechanism of one coordinate, named as the output.
+        Mechanism with one coordinate that has the name of the output.
 
     Source: Newton 1687.
 
@@ -60,25 +60,25 @@ def single_inertia(
 
 
 FORCE_PER_VOLT = 35.15065188248547
-"""Force on the carriage per volt of command [N/V], as the recordings give it."""
+"""Force on the carriage per volt of command [N/V], as given with the recordings."""
 
 
 def emps(mass: float = 80.0, *, damping: float = 100.0, gain: float = FORCE_PER_VOLT) -> Mechanism:
-    """A linear axis: mass, viscous damping and a drive in proportion to the voltage, one output.
+    """A linear axis with a mass, viscous damping, a force proportional to the voltage, and one output.
 
         mass x'' = gain v - damping x'
 
-    The gain is trusted, mass and damping are free. What friction the axis has is for a search to find.
+    The gain is trusted; mass and damping are free. Dry friction is left for a search to find.
 
     Args:
-        mass: Of carriage, screw and rotor together, as the carriage feels it [kg].
-        damping: [N s/m].
+        mass: Mass of carriage, screw and rotor together, reflected to the carriage [kg].
+        damping: Viscous damping [N s/m].
         gain: Force per volt [N/V].
 
     Returns:
         Mechanism with the output `position` [m] and the port `axis`.
 
-    Source: Janot, Gautier and Brunot 2019, Data set and reference models of EMPS, equation 1 less
+    Source: Janot, Gautier and Brunot 2019, Data set and reference models of EMPS, equation 1 without
         friction and offset.
 
     >>> emps().free_names
@@ -106,18 +106,18 @@ def silverbox(frequency: float = 60.0, *, damping_ratio: float = 0.1, stiffness:
         mass y'' + damping y' + stiffness y = v
 
     The output in volts stands for the position and the input for the force, so the gain is one and
-    held; mass, damping and stiffness are free. The input of the public recordings is smooth between
+    trusted; mass, damping and stiffness are free. The input of the public recordings is smooth between
     its samples: simulate with `Exponential(substeps=4, between="smooth")`.
 
     Args:
-        frequency: Of the resonance, where to start [Hz].
-        damping_ratio: Where to start.
-        stiffness: Input per output at rest, where to start.
+        frequency: Start value of the resonance frequency [Hz].
+        damping_ratio: Start value of the damping ratio.
+        stiffness: Start value of the stiffness, the input per output at rest.
 
     Returns:
         Mechanism with the output `output` [V] and the port `joint`.
 
-    Source: Wigren and Schoukens 2013, section on the Silverbox, less the cubic spring.
+    Source: Wigren and Schoukens 2013, section on the Silverbox, without the cubic spring.
 
     >>> silverbox().free_names
     ('joint.inertia.inertia', 'joint.viscous.coefficient', 'joint.spring.stiffness')
@@ -145,16 +145,17 @@ GEAR_RATIO, TORQUE_CONSTANT, RESISTANCE = 48.4, 0.0107, 3.29
 
 
 def rotary_arm(flexible: bool = False, *, arm_inertia: float = 0.004, stiffness: float = 1.0) -> Mechanism:
-    """The arm of the laboratory with its constants as a start; the motor is trusted as a whole.
+    """The rotary arm of a student laboratory with its constants; all parameters of the motor are trusted.
 
-    Rigid, one inertia with the output `theta`. Flexible, a hub and an arm on a spring with the outputs
-    `theta` and `alpha`, the angle of the tip against the hub; there the laboratory gives the hub's
-    inertia, the arm's and the stiffness are a guess, and all three are free.
+    The rigid arm is one inertia with the output `theta`. The flexible arm is a hub and an arm on a spring,
+    with the outputs `theta` and `alpha`, the angle of the tip relative to the hub. For the flexible arm the
+    laboratory gives the inertia of the hub; the inertia of the arm and the stiffness are guesses. All three
+    are free.
 
     Args:
-        flexible: Which of the two arms.
-        arm_inertia: Of the flexible arm, where to start [kg m^2].
-        stiffness: Of the flexible arm, where to start [N m/rad].
+        flexible: True for the flexible arm, False for the rigid arm.
+        arm_inertia: Start value of the inertia of the flexible arm [kg m^2].
+        stiffness: Start value of the stiffness of the flexible arm [N m/rad].
 
     Returns:
         Mechanism with the ports of `single_inertia` or of a flexible joint.
@@ -203,21 +204,21 @@ TWO_DOF_LINK = MappingProxyType(
         ),
     }
 )
-"""Constants of the laboratory by stage: J11, J12, Ks1, Ktg1, B11, B12 and the same with 2, in SI units."""
+"""Constants of the laboratory by stage: J11, J12, Ks1, Ktg1, B11, B12 and those of stage 2, in SI units."""
 
 
 def two_dof_link(stage: int = 1) -> Mechanism:
-    """One stage of the serial flexible link by itself: a flexible joint driven by a current.
+    """One stage of the serial flexible link alone: a flexible joint driven by a current.
 
         hub_inertia theta'' + arm_inertia (theta'' + alpha'') = torque_per_current i - hub_damping theta'
         arm_inertia (theta'' + alpha'') = -stiffness alpha - joint_damping alpha'
 
-    The torque per current and the inertia of the arm are trusted: where friction holds the hub, the
-    motion shows the frequency of the link and hardly how much of the inertia is behind it, and a fit may
-    give all of it to the hub. The others are free and start at the laboratory's constants. Of these the
-    damping of the hubs is above what the recordings show, and the dry friction of the gears is missing.
-    Stage 2 stands on the end of link 1, whose motion this model does not know; recordings have its
-    acceleration as a signal (`effects.MeasuredDisturbance`). `two_stage_link` is both stages in one.
+    The torque per current and the inertia of the arm are trusted: while friction holds the hub, the motion
+    shows the frequency of the link but hardly the inertia of the arm, and a fit may assign all inertia to the
+    hub. The other parameters are free and start at the constants of the laboratory. Among these constants the
+    damping of the hubs is larger than in the recordings, and the dry friction of the gears is missing.
+    Stage 2 is mounted on the end of link 1, whose motion is not part of this model; recordings have its
+    acceleration as a signal (`effects.MeasuredDisturbance`). `two_stage_link` is a model of both stages.
 
     Args:
         stage: 1, which carries stage 2, or 2.
@@ -260,19 +261,21 @@ def two_stage_link() -> Mechanism:
     """Both stages of the serial flexible link in one mechanism: two currents, four coordinates, four outputs.
 
         theta1, alpha1    angle of hub 1, deflection of link 1
-        theta2, alpha2    the same of stage 2, relative to the end of link 1
+        theta2, alpha2    angle of hub 2, deflection of link 2, relative to the end of link 1
 
     With the angles `beta1 = theta1 + alpha1` and `beta2 = beta1 + theta2 + alpha2` of the links, twice the
     kinetic energy is
 
         J11 theta1'^2 + J12 beta1'^2 + J21 theta2'^2 + J22 beta2'^2 + m (L beta1' + l beta2')^2
 
-    with the centre of mass of link 2 at `l`, half its length, on the end of link 1 of length `L = 2 l`, for
-    small angles between the links. `m l^2` is the inertia at the port `mass2` of position `2 beta1 + beta2`.
+    for small angles between the links. The centre of mass of link 2 is at `l`, half the length of link 2, and
+    link 2 is mounted on the end of link 1, which has the length `L = 2 l`. `m l^2` is the inertia at the port
+    `mass2` with the position `2 beta1 + beta2`.
 
-    The first current is the input, the second one a signal of the recording. The torques per current and the
-    inertia of arm 1 are trusted. Start values are the laboratory's constants of each stage by itself: of
-    link 2 three quarters are at `mass2`, as of a uniform beam, and arm 1 has so much less that its sum stays.
+    The first current is the input, the second current a signal of the recording. The torques per current and
+    the inertia of arm 1 are trusted. Start values are the constants of the laboratory for each stage alone.
+    Three quarters of the inertia of link 2 are at `mass2`, as for a uniform beam, and the inertia of arm 1 is
+    reduced so that the sum stays the same.
 
     Source: Constants of the laboratory in lqr_full_10deg.mat; Quanser, 2-DOF serial flexible link, reference
         manual, 2011.

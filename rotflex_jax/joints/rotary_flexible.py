@@ -7,9 +7,9 @@ Each of two equal, preloaded springs runs from an anchor on the hub to the arm:
 with the anchors at the distances `d` (hub) and `R` (arm) from the axis along the arm, and `r` to
 the side.
 
-Coordinates are the hub angle `theta` and the deflection `alpha` of the arm relative to the hub, so
-the arm itself turns with `theta + alpha`; a positive voltage turns the hub forwards and leaves the
-arm behind (first deflection negative).
+The coordinates are the hub angle `theta` and the deflection `alpha` of the arm relative to the hub, so
+the absolute angle of the arm is `theta + alpha`. A positive voltage turns the hub forwards and leaves the
+arm behind, so the first deflection is negative.
 """
 
 import math
@@ -32,8 +32,8 @@ class SpringType(NamedTuple):
 
     Attributes:
         length: Free length [m].
-        preload: Force that opens the coils [N].
-        rate: Force per length beyond that [N/m].
+        preload: Force at which the coils begin to open [N].
+        rate: Further force per length [N/m].
     """
 
     length: float
@@ -41,7 +41,7 @@ class SpringType(NamedTuple):
     rate: float
 
 
-# Spring 1 is the softest, 2 the maker's default.
+# Spring 1 is the softest; spring 2 is the default of the manufacturer.
 SPRINGS: dict[int, SpringType] = {
     1: SpringType(1.00 * INCH, 0.85, 187.0),
     2: SpringType(1.25 * INCH, 1.33, 312.8),
@@ -56,7 +56,7 @@ ARM_ANCHORS: dict[int, float] = {1: 4.0 * INCH, 2: 3.5 * INCH, 3: 3.0 * INCH}
 def spring_stiffness(
     spring: int = 2, hub_anchor: str = "B", arm_anchor: int = 2, *, preload_only: bool = False
 ) -> float:
-    """Stiffness of the joint at small deflections, by the geometry of the springs.
+    """Stiffness of the joint at small deflections, from the geometry of the springs.
 
         K = 2 (rate R^2 r^2 / D + F (R d / sqrt(D) - R^2 r^2 / D^1.5))
         D = r^2 + (R - d)^2,   F = preload + rate (sqrt(D) - length)
@@ -67,14 +67,14 @@ def spring_stiffness(
         spring: 1, 2 or 3; see `SPRINGS`.
         hub_anchor: "A", "B" or "C".
         arm_anchor: 1, 2 or 3.
-        preload_only: Take the preload for the whole force at the working length, as the maker did
+        preload_only: Take the preload as the whole force at the working length, as the manufacturer did
             before 2010.
 
     Returns:
         Stiffness [N m/rad].
 
     Raises:
-        InputError: No such setting.
+        InputError: The setting does not exist.
 
     Source: Quanser, config_rotflex.m, 2010; with `preload_only` config_flexjoint.m, 2002.
 
@@ -110,10 +110,10 @@ def spring_settings() -> dict[tuple[int, str, int], float]:
 
 PORTS = {"hub": (1.0, 0.0), "joint": (0.0, 1.0), "arm": (1.0, 1.0)}
 SENSORS = {"theta": ("hub", "position"), "alpha": ("joint", "position"), "speed": ("hub", "speed")}
-"""What may be measured of a joint, and where."""
+"""Sensors of a joint: name -> port and measured quantity."""
 _BOTH = ("theta", "alpha")
 
-# SRV02 in high gear: oz in/A and V/kRPM converted, efficiency of the motor times the gearbox's.
+# SRV02 in high gear: converted from oz in/A and V/kRPM; efficiency of the motor times that of the gearbox.
 _TORQUE_CONSTANT = 1.088 * 0.2780139 * INCH
 _BACK_EMF = 0.804e-3 * 60 / (2 * math.pi)
 _EFFICIENCY = 0.69 * 0.90
@@ -135,32 +135,35 @@ def flexible_joint(
         hub_inertia theta'' + arm_inertia (theta'' + alpha'') = motor - hub_damping theta'
         arm_inertia (theta'' + alpha'') = -stiffness alpha - joint_damping alpha'
 
-    Angles and voltage determine torques only up to a common factor, so the arm's inertia is
-    trusted, and of the motor everything but its torque constant. Free are hub inertia, stiffness,
-    torque constant and both dampers. From the deflection alone four parameters describe all that is linear
-    between voltage and deflection, so that a model without dry friction leaves one combination of the five
-    open, and they have no intervals. Friction at the hub closes it: where it holds depends on the hub's own
-    motion, which a wrong torque constant would scale.
+    Angles and voltage determine torques only up to a common factor, so the inertia of the arm is trusted, and
+    all parameters of the motor except its torque constant. The hub inertia, the stiffness, the torque
+    constant and both dampers are free.
 
-    The free torque constant stands for its product with the efficiency, which nobody knows well: a measured
-    joint of the maker gives 0.0097 N m/A for 0.0077, and with a back-EMF constant that follows it a negative
-    damping of the hub. So the two constants are tied only where the motor says so (`tied=True`); otherwise
-    the back-EMF constant is trusted, and an estimate of the hub's damping says how it depends on that.
+    If only the deflection is measured, four parameters describe all linear dynamics from voltage to
+    deflection. A model without dry friction then leaves one combination of the five free parameters open, and
+    they have no intervals. Friction at the hub determines this combination: when it holds the hub depends on
+    the motion of the hub, which a wrong torque constant would scale.
+
+    The free torque constant stands for its product with the efficiency, which is not known well. For a
+    measured joint of the manufacturer the estimate is 0.0097 N m/A instead of 0.0077; with a back-EMF
+    constant that follows it, the damping of the hub becomes negative. Therefore the two constants are tied
+    only if the motor has `tied=True`. Otherwise the back-EMF constant is trusted, and the estimate of the
+    hub damping states how it depends on the back-EMF constant.
 
     Args:
-        hub_inertia: With motor and gears, as the hub feels it [kg m^2].
-        arm_inertia: [kg m^2].
-        stiffness: Of the joint [N m/rad].
+        hub_inertia: Inertia of hub, motor and gears, reflected to the hub [kg m^2].
+        arm_inertia: Inertia of the arm [kg m^2].
+        stiffness: Stiffness of the joint [N m/rad].
         motor: Motor with its gear.
-        hub_damping: Viscous damping beside the motor's own [N m s/rad].
+        hub_damping: Viscous damping in addition to that of the motor [N m s/rad].
         joint_damping: Viscous damping of the deflection [N m s/rad].
-        sensors: What is measured: `theta`, `alpha`, the hub's `speed`; or several, as `"theta+alpha"`.
+        sensors: What is measured: `theta`, `alpha`, the `speed` of the hub; or several, as `"theta+alpha"`.
 
     Returns:
         Mechanism with these outputs.
 
     Raises:
-        InputError: No sensor, or another one.
+        InputError: No sensor, an unknown sensor, or one sensor twice.
 
     Source: Lagrange's equations; Quanser, Rotary Flexible Joint workbook, 2011.
     """
@@ -210,28 +213,30 @@ def paper(
 ) -> Mechanism:
     """The joint of the paper "Nonlinear Identification of a Rotary Flexible Joint Experiment".
 
-    No loss in the gear and no damping but the motor's own. Not for a module of the maker's later
-    series, whose arm is lighter and whose gear loses more than a third: `quanser_2010`.
+    By default there is no loss in the gear and no damping except that of the motor. Not for a module of the
+    manufacturer's later series, whose arm is lighter and whose gear loses more than a third: use
+    `quanser_2010`.
 
     Args:
-        hub_inertia: [kg m^2].
-        arm_inertia: [kg m^2].
-        stiffness: [N m/rad].
-        torque_constant: [N m/A].
-        back_emf: [V s/rad].
-        resistance: [ohm].
+        hub_inertia: Inertia of hub, motor and gears, reflected to the hub [kg m^2].
+        arm_inertia: Inertia of the arm [kg m^2].
+        stiffness: Stiffness of the joint [N m/rad].
+        torque_constant: Torque constant of the motor [N m/A].
+        back_emf: Back-EMF constant of the motor [V s/rad].
+        resistance: Armature resistance [ohm].
         gear_ratio: Turns of the motor per turn of the hub.
-        efficiency: Of motor and gear.
-        inductance: [H]; the maker says 0.18 mH. None for a current that follows at once.
-        hub_damping: [N m s/rad].
-        joint_damping: [N m s/rad].
-        tied: Whether `back_emf` is the torque constant, also in fits; for a known efficiency.
-        sensors: What is measured; see `flexible_joint`.
+        efficiency: Efficiency of motor and gear.
+        inductance: Armature inductance [H], 0.18 mH according to the manufacturer; None for a current that
+            follows the voltage at once.
+        hub_damping: Viscous damping at the hub in addition to that of the motor [N m s/rad].
+        joint_damping: Viscous damping of the deflection [N m s/rad].
+        tied: Whether `back_emf` equals the torque constant, also in fits; for a known efficiency.
+        sensors: Measured quantities; see `flexible_joint`.
 
     Returns:
-        Mechanism with the outputs `theta` and `alpha`, or with those of the sensors given.
+        Mechanism with the outputs `theta` and `alpha`, or with the outputs of the given sensors.
 
-    Source: That paper's table of parameters; its stiffness is in N m/rad, not N/m as printed.
+    Source: Table of parameters of that paper; its stiffness is in N m/rad, not N/m as printed.
 
     >>> joint = paper(inductance=0.18e-3)
     >>> joint.channels
@@ -269,21 +274,21 @@ def quanser_2002(
     tied: bool = False,
     sensors: str | Sequence[str] = _BOTH,
 ) -> Mechanism:
-    """The maker's joint on an SRV02 servo, by the files of 2002.
+    """The joint of the manufacturer on an SRV02 servo, according to the manufacturer's files of 2002.
 
-    They take the springs' preload for their whole force, and little damping at the hub.
+    These take the preload of the springs as their whole force, and assume little damping at the hub.
 
     Args:
-        arm: Where the short arm sits on the main arm: 1, 2 or 3 outwards, 0 for none.
-        spring: 1, 2 or 3.
+        arm: Position of the short arm on the main arm: 1, 2 or 3 outwards, 0 for no short arm.
+        spring: 1, 2 or 3; see `SPRINGS`.
         hub_anchor: "A", "B" or "C".
         arm_anchor: 1, 2 or 3.
-        inductance: [H] or None.
-        tied: Whether the back-EMF constant is the torque constant, also in fits; for a known efficiency.
-        sensors: What is measured; see `flexible_joint`.
+        inductance: Armature inductance [H], or None.
+        tied: Whether the back-EMF constant equals the torque constant, also in fits; for a known efficiency.
+        sensors: Measured quantities; see `flexible_joint`.
 
     Returns:
-        Mechanism with the outputs `theta` and `alpha`, or with those of the sensors given.
+        Mechanism with the outputs `theta` and `alpha`, or with the outputs of the given sensors.
 
     Source: Quanser, config_servo_exp.m and config_flexjoint.m, 2002.
     """
@@ -301,19 +306,19 @@ def quanser_2010(
     tied: bool = False,
     sensors: str | Sequence[str] = _BOTH,
 ) -> Mechanism:
-    """The maker's joint on an SRV02 servo, by the files of 2010.
+    """The joint of the manufacturer on an SRV02 servo, according to the manufacturer's files of 2010.
 
     Args:
-        arm: Where the short arm sits on the main arm: 1, 2 or 3 outwards, 0 for none.
-        spring: 1, 2 or 3.
+        arm: Position of the short arm on the main arm: 1, 2 or 3 outwards, 0 for no short arm.
+        spring: 1, 2 or 3; see `SPRINGS`.
         hub_anchor: "A", "B" or "C".
         arm_anchor: 1, 2 or 3.
-        inductance: [H] or None.
-        tied: Whether the back-EMF constant is the torque constant, also in fits; for a known efficiency.
-        sensors: What is measured; see `flexible_joint`.
+        inductance: Armature inductance [H], or None.
+        tied: Whether the back-EMF constant equals the torque constant, also in fits; for a known efficiency.
+        sensors: Measured quantities; see `flexible_joint`.
 
     Returns:
-        Mechanism with the outputs `theta` and `alpha`, or with those of the sensors given.
+        Mechanism with the outputs `theta` and `alpha`, or with the outputs of the given sensors.
 
     Source: Quanser, config_srv02.m and config_rotflex.m, 2010.
     """
@@ -322,10 +327,10 @@ def quanser_2010(
 
 
 def arm_inertia(arm: int = 2) -> float:
-    """Moment of inertia [kg m^2] of the maker's arm about the joint.
+    """Moment of inertia [kg m^2] of the manufacturer's arm about the axis of the joint.
 
-    A main arm of 64 g and 11.75 in, alone (0) or with a short arm of 30 g and 6 in whose middle
-    sits 9, 10 or 11 in from the axis (1, 2, 3).
+    The main arm has 64 g and 11.75 in. It is alone (0) or carries a short arm of 30 g and 6 in, whose centre
+    is 9, 10 or 11 in from the axis (1, 2, 3).
 
     Source: Quanser, config_rotflex.m, 2010.
 
@@ -344,11 +349,11 @@ def arm_inertia(arm: int = 2) -> float:
 
 
 def hub_inertia(tachometer: bool = True, body: float = 0.0005) -> float:
-    """Moment of inertia [kg m^2] of the maker's servo and the body on it, seen at the load shaft.
+    """Moment of inertia [kg m^2] of the manufacturer's servo and the body on it, reflected to the load shaft.
 
     Args:
-        tachometer: Whether the motor has one.
-        body: What sits on the load shaft, the body of the joint by default [kg m^2].
+        tachometer: Whether the motor has a tachometer.
+        body: Inertia of the body on the load shaft; by default the body of the joint [kg m^2].
 
     Source: Quanser, config_servo_exp.m, 2002, and config_srv02.m, 2010, in high gear.
 
@@ -357,17 +362,17 @@ def hub_inertia(tachometer: bool = True, body: float = 0.0005) -> float:
     """
     disc = lambda mass, diameter: mass * (diameter / 2 * INCH) ** 2 / 2  # noqa: E731
     gears = disc(0.005, 0.5) + 2 * disc(0.030, 1.5) + disc(0.083, 2.5)
-    # Rotor and tachometer, oz in s^2 converted.
+    # Rotor and tachometer, converted from oz in s^2.
     motor = (5.523e-5 + (1e-5 if tachometer else 0.0)) * 0.2780139 * INCH
     return gears + _GEAR_RATIO**2 * 0.90 * motor + body
 
 
 def srv02_motor(inductance: float | None = None, *, tied: bool = False) -> Motor:
-    """Motor and gear of the maker's servo.
+    """Motor and gear of the manufacturer's servo.
 
     Args:
-        inductance: [H] or None.
-        tied: Whether the back-EMF constant is the torque constant, also in fits.
+        inductance: Armature inductance [H], or None.
+        tied: Whether the back-EMF constant equals the torque constant, also in fits.
 
     Source: Quanser, config_srv02.m, 2010, in high gear.
     """

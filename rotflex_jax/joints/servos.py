@@ -1,4 +1,4 @@
-"""Hobby servos under the position loop of their firmware: the input is a goal angle."""
+"""Hobby servos with the position loop of their firmware: the input is a goal angle."""
 
 import dataclasses
 from typing import Literal, get_args
@@ -19,7 +19,7 @@ from rotflex_jax.mechanism import Mechanism
 from rotflex_jax.mechanism.quantity import Units
 
 FREE_FALL = 9.80665
-"""Acceleration of free fall [m/s^2]."""
+"""Standard acceleration of gravity [m/s^2]."""
 
 FIRMWARE = (
     "gain",
@@ -34,11 +34,11 @@ FIRMWARE = (
     "integral",
     "anti_windup",
 )
-"""Parameters of `PositionServo` and `PidServo` that their user or the firmware has set."""
+"""Parameters of `PositionServo` and `PidServo` that the user or the firmware sets."""
 
 ServoKind = Literal["xl330", "sts3215"]
 METERS: dict[str, type[Memory]] = {"current": CurrentMeter, "duty": DutyMeter}
-"""Reading of a servo -> the effect that shows it."""
+"""Reading of a servo -> the effect that provides it."""
 
 
 def position_servo(
@@ -48,14 +48,14 @@ def position_servo(
 
         inertia theta'' = servo(goal, theta, theta') - sine sin(theta) - cosine cos(theta)
 
-    The firmware is trusted, and so is the inertia: goal and angle determine torques only up to a common
-    factor. Torque constant, resistance and both amplitudes of the weight are free. Where the gain is not
-    known, release it: stiffness, damping and largest torque are three numbers for three.
+    The parameters of the firmware are trusted, and so is the inertia: goal and angle determine torques only
+    up to a common factor. Torque constant, resistance and both amplitudes of the weight are free. If the gain
+    is not known, release it: stiffness, damping and largest torque then determine the three parameters.
 
     Args:
-        inertia: Of the joint with rotor and gear [kg m^2].
+        inertia: Inertia of the joint with rotor and gear [kg m^2].
         servo: The servo with its firmware; None for a Dynamixel XL-330.
-        weight: Torque of the weight when the angle is a quarter turn, where to start [N m].
+        weight: Start value of the torque of the weight when the angle is a quarter turn [N m].
 
     Returns:
         Mechanism with the output `theta` [rad] and the port `hub`; its input is the goal [rad].
@@ -88,17 +88,17 @@ def xl330_pendulum(
 
         (mass length^2 + rotor_inertia) theta'' = servo(goal, theta, theta') - mass g length sin(theta)
 
-    The weight is known and sets the scale of all torques, so the inertia is free beside torque constant and
-    resistance, and so is the cosine of the weight, by which the zero of the encoder may be off the lowest
-    point. Gain and supply follow the recording where it knows them. Friction is not in it: without any, a
-    fit takes it for back-EMF.
+    The weight is known and sets the scale of all torques. Therefore the inertia is free, as are the torque
+    constant and the resistance. The cosine amplitude of the weight is free as well: it describes an encoder
+    zero that is not at the lowest point. If the recording has the gain and the supply as constants, these
+    values are used. The model has no friction; a fit of it attributes friction to the back-EMF.
 
     Args:
-        mass: At the end of the pendulum [kg].
-        length: Of the pendulum [m].
-        gain: P gain of the firmware, where a recording does not know it.
-        supply: Supply voltage, where a recording does not know it [V].
-        rotor_inertia: Of rotor and gear, seen behind the gear, where to start [kg m^2].
+        mass: Mass at the end of the pendulum [kg].
+        length: Length of the pendulum [m].
+        gain: P gain of the firmware, for recordings without this constant.
+        supply: Supply voltage, for recordings without this constant [V].
+        rotor_inertia: Start value of the inertia of rotor and gear, at the output of the gear [kg m^2].
 
     Returns:
         Mechanism with the output `theta` [rad] and the port `hub`; its input is the goal [rad].
@@ -127,27 +127,28 @@ def sts3215(
     dead_band: float = 0.0,
     weight: float = 0.0,
 ) -> Mechanism:
-    """A joint on a Feetech STS3215 of 7.4 V, as arms like the SO-101 have, from goal angle to angle.
+    """A joint on a 7.4 V Feetech STS3215, a servo of arms such as the SO-101, from goal angle to angle.
 
         inertia theta'' = servo(goal, theta, theta') - sine sin(theta) - cosine cos(theta)
 
-    `position_servo` with the duty per angle, the largest duty and the motor that were measured at such a
-    servo. The P gain is a register of the servo, 32 when it is new; arms often have less. Not with a speed or
-    acceleration limit set in the servo, which plans a profile towards the goal.
+    This is `position_servo` with the duty per angle, the largest duty and the motor constants that were
+    measured on such a servo. The P gain is a register of the servo, 32 when it is new; arms often have a
+    lower gain. Not for a servo with a speed or acceleration limit, which plans a profile towards the goal.
 
     Args:
-        inertia: Of the joint with rotor and gear; that of the rotor behind the gear is 0.028 [kg m^2].
+        inertia: Inertia of the joint with rotor and gear; the rotor alone, at the output of the gear, has
+            0.028 [kg m^2].
         gain: P gain, register 21 of the servo.
         supply: Supply voltage [V].
-        dead_band: Error that the servo takes for none [rad]; a count is 1.53 mrad.
-        weight: Torque of the weight when the angle is a quarter turn, where to start [N m].
+        dead_band: Error up to which the servo does not react [rad]; a count is 1.53 mrad.
+        weight: Start value of the torque of the weight when the angle is a quarter turn [N m].
 
     Returns:
         Mechanism with the output `theta` [rad] and the port `hub`; its input is the goal [rad].
 
-    Source: Duclusaud, Passault, Padois, Ly 2024, arXiv 2410.08650, and the numbers of this servo published
-        with it: 0.166 duty per radian and unit of the gain, at most 0.97, by an oscilloscope; torque
-        constant, resistance and rotor as fitted there by model M1.
+    Source: Duclusaud, Passault, Padois, Ly 2024, arXiv 2410.08650, and the values of this servo published
+        with it: 0.166 duty per radian and unit of the gain, at most 0.97, measured with an oscilloscope;
+        torque constant, resistance and rotor as fitted there with model M1.
 
     >>> round(sts3215(gain=16).effect("position_servo", "hub").stamp().stiffness, 2)
     8.87
@@ -177,36 +178,36 @@ def servo(
     weight: float = 0.0,
     sensors: str = "theta",
 ) -> Mechanism:
-    """A joint on a servo of a known kind, with what its log has, from goal angle to angle.
+    """A joint on a servo of a known kind, with the readings of its log as outputs, driven by a goal angle.
 
         inertia theta'' = servo(goal, theta, theta') - sine sin(theta) - cosine cos(theta)
 
-    `position_servo` with the numbers of the kind; with an I gain the loop is a `PidServo`. The parameter
-    `enabled` is there too: a stretch of a log in which the torque is off is a recording of its own, with
-    `constants={"hub.position_servo.enabled": 0.0}` (`hub.pid_servo.enabled`). Not with a speed or
-    acceleration limit set in the servo, which plans a profile towards its goal.
+    This is `position_servo` with the constants of the kind; with an I gain the loop is a `PidServo`. The
+    parameter `enabled` exists too: a stretch of a log in which the torque is off is a separate recording with
+    `constants={"hub.position_servo.enabled": 0.0}` (or `hub.pid_servo.enabled`). Not for a servo with a speed
+    or acceleration limit, which plans a profile towards its goal.
 
-    The gains are those that the servo's registers have. For the XL-330 the manual's ratios of the three gains
-    and the size that logs show for the P gain are taken, half of the manual's; for the STS3215 the P gain was
-    measured, and I and D gain are the duty per error and second, or per speed, that the caller says.
+    The gains are the values in the registers of the servo. For the XL-330, the ratios of the three gains come
+    from the manual, and the size comes from the P gain that logs show, half of the value in the manual. For
+    the STS3215 the P gain was measured; I and D gain are given as duty per error and second, and per speed.
 
     Args:
         kind: "xl330", a Dynamixel XL-330; "sts3215", a Feetech STS3215 of 7.4 V.
-        inertia: Of the joint with rotor and gear [kg m^2]; None for a bare arm of that size.
-        gain: P gain, as new if None: 400 and 32.
+        inertia: Inertia of the joint with rotor and gear [kg m^2]; None for a bare arm of that size.
+        gain: P gain; the factory value, 400 or 32, if None.
         integral: I gain, or None: in counts of the register for the XL-330, else [1/(rad s)].
         derivative: D gain, or None: in counts of the register for the XL-330, else [s/rad].
-        dead_band: Error that the servo takes for none [rad], or None.
+        dead_band: Error up to which the servo does not react [rad], or None.
         supply: Supply voltage [V].
-        source_resistance: Of supply and cable [ohm], or None.
-        weight: Torque of the weight when the angle is a quarter turn, where to start [N m].
-        sensors: What the log has: "theta", "theta+current" [A], "theta+duty" or "theta+current+duty".
+        source_resistance: Resistance of supply and cable [ohm], or None.
+        weight: Start value of the torque of the weight when the angle is a quarter turn [N m].
+        sensors: Readings in the log: "theta", "theta+current" [A], "theta+duty" or "theta+current+duty".
 
     Returns:
         Mechanism with these outputs and the port `hub`; its input is the goal [rad].
 
     Raises:
-        InputError: Another kind, or sensors that are none of these.
+        InputError: The kind or the sensors are not among these.
 
     Source: Robotis, XL330-M288-T e-manual, control tables 80 to 84; else as `xl330_pendulum` and `sts3215`.
 
@@ -220,7 +221,8 @@ def servo(
     channels = one_of(sensors, "sensors", combined).split("+")
     if kind == "xl330":
         preset = position_servo(0.005 if inertia is None else inertia, weight=weight)
-        # By error in counts and periods: duty = P e / 256 + I sum(e) / 131072 - D change / 32, over 885.
+        # With the error e in counts at each period:
+        # duty = (P e / 256 + I sum(e) / 131072 - D change / 32) / 885.
         per_sum, per_change = DYNAMIXEL_GAIN_SCALE / (512 * 1e-3), 8 * DYNAMIXEL_GAIN_SCALE * 1e-3
         if integral is not None:
             integral = per_sum * number(integral, "integral", least=0, example="100")

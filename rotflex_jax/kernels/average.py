@@ -1,4 +1,4 @@
-"""Kernels that least squares finds under a Gaussian input, and what each effect contributes to them."""
+"""Kernels that least squares finds under a Gaussian input, and the contribution of each effect to them."""
 
 import dataclasses
 from typing import Any, NamedTuple
@@ -22,7 +22,7 @@ from rotflex_jax.text.numbers import json_number
 
 
 class AveragingRun(NamedTuple):
-    """The input of the average and its division into blocks.
+    """The input over which kernels are averaged, and its division into blocks.
 
     Attributes:
         u: Voltage [V].
@@ -32,7 +32,7 @@ class AveragingRun(NamedTuple):
         reach: Lags L of the output derivatives.
         blocks: Number of blocks.
         width: Samples per block; the last block ends with the recording.
-        mirrored: Whether the voltage of opposite sign takes part.
+        mirrored: Whether the average includes the voltage with opposite sign.
         unit: Units of input and output.
     """
 
@@ -48,7 +48,7 @@ class AveragingRun(NamedTuple):
 
     @property
     def about(self) -> float:
-        """Input level that the kernels are about [V]."""
+        """Input level about which the kernels are defined [V]."""
         return 0.0 if self.mirrored else float(np.mean(self.u))
 
     @classmethod
@@ -62,7 +62,7 @@ class AveragingRun(NamedTuple):
         blocks: int,
         mirrored: bool,
     ) -> "AveragingRun":
-        """The run of checked arguments, with the first state estimated from a recording."""
+        """A run from arguments, which are checked; the first state is estimated if `data` is a recording."""
         reach, blocks = 2 * memory if reach is None else whole(reach, "reach", 1), whole(blocks, "blocks", 2)
         x0 = rest_state(s.mechanism.structure, np.float64)
         channel = s.mechanism.channels[s.output]
@@ -119,28 +119,29 @@ def average_kernels(
     are not differentiable, such as dry friction, whose Taylor kernels at rest are zero.
 
     Not for an input far from Gaussian (steps, a controller's voltage): the slopes are still averages over
-    that motion, but least squares weights the motions differently. Fit the series to the model's
-    simulated output in that case, beside the one fitted to the measurement.
+    that motion, but least squares weights the motions differently. In that case fit the series to the
+    simulated output of the model, and compare it with the series that is fitted to the measurement.
 
     Args:
         model: Mechanism, or a model with its own integration rule and gates.
-        data: Recording, for its voltage and first state, or the voltage [V] from rest.
+        data: Recording, which gives voltage and first state, or a voltage [V] that starts from rest.
         channel: Output.
         memory: Number of lags M, from 0 to M - 1.
-        Ts: Sampling period [s], where `data` is a voltage.
+        Ts: Sampling period [s], if `data` is a voltage.
         reach: Number of lags L >= M of the output derivatives, which should decay within them unless the
             input is white. Twice the memory if None.
-        blocks: Blocks of the recording, from whose scatter the standard errors follow.
-        mirrored: Average over the voltage and the same with opposite sign, which are equally likely where
-            the mean is zero. An odd mechanism then has no quadratic kernel to the last digit.
-        autocovariance: Of the input at lags 0 to L - 1 [V^2], where it is known; else the sample's, as
-            in a least-squares fit of the same recording.
+        blocks: Number of blocks of the recording, whose scatter gives the standard errors.
+        mirrored: Whether to average over the voltage and the voltage with opposite sign, which are equally
+            likely if the mean is zero. The quadratic kernel of an odd mechanism is then exactly zero.
+        autocovariance: Autocovariance of the input at lags 0 to L - 1 [V^2], if it is known; None for the
+            sample autocovariance, as in a least-squares fit of the same recording.
 
     Returns:
-        Kernels about the mean voltage (zero where mirrored), with standard errors.
+        Kernels about the mean voltage (zero if mirrored), with standard errors.
 
     Raises:
-        InputError: An unknown channel, too few samples, or an input with an ill-conditioned covariance.
+        InputError: The channel is unknown, there are too few samples, or the covariance of the input is
+            ill-conditioned.
 
     Source: Stein, Ann. Stat. 9, 1981, lemma 2; Price, IRE Trans. Inf. Theory 4, 1958; Schetzen, The
     Volterra and Wiener Theories of Nonlinear Systems, 1980.
@@ -151,7 +152,7 @@ def average_kernels(
 
 
 class BlockKernels(NamedTuple):
-    """Kernels of each block, whose means are the kernels, and the covariance R of the input."""
+    """Kernels of each block, whose means over the blocks are the kernels, and covariance R of the input."""
 
     h0: Float[np.ndarray, " B"]
     h1: Float[np.ndarray, "B M"]
@@ -219,7 +220,7 @@ def _blocks(
 
 
 def kernels_of(run: AveragingRun, found: BlockKernels, channel: str) -> Kernels:
-    """Means over the blocks, standard errors from their scatter."""
+    """Kernels as means over the blocks, with standard errors from the scatter of the blocks."""
     mean, root = lambda a: np.mean(a, axis=0), np.sqrt(run.blocks)
     std = lambda a: np.std(a, axis=0, ddof=1) / root  # noqa: E731
     u = run.u - run.about
@@ -246,9 +247,9 @@ def kernels_of(run: AveragingRun, found: BlockKernels, channel: str) -> Kernels:
 
 
 DETECTED_STANDARD_ERRORS = 2.0
-"""A smaller change (rms over the kernel) is reported as nothing; chance gives about one."""
+"""Least change (rms over the kernel, in standard errors) that is reported; chance gives about one."""
 ROUNDING_SHARE = 1e-9
-"""Changes and errors below this share of the linear kernel are rounding."""
+"""Changes and errors below this share of the linear kernel count as rounding errors."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -259,9 +260,9 @@ class EffectShare:
         effect: The effect, with its parameter values.
         change: Kernels with it less kernels without it; standard errors of the difference.
         linear: Size of the change of `h1` as a share of the linear response, less its expected noise.
-        quadratic: Size of the change of `h2` as a share of the linear response, likewise.
-        z: Root mean square of both changes in standard errors; chance alone gives about one. Zero where
-            nothing changed at all, infinite where the change is the same at all inputs, as a linear effect's.
+        quadratic: Size of the change of `h2` as a share of the linear response, less its expected noise.
+        z: Root mean square of both changes in standard errors; chance alone gives about one. Zero if a kernel
+            does not change, infinite if its change is the same for all inputs, as for a linear effect.
     """
 
     effect: Effect
@@ -272,7 +273,7 @@ class EffectShare:
 
     @property
     def name(self) -> str:
-        """For instance "coulomb at hub"."""
+        """Name and port of the effect, for instance "coulomb at hub"."""
         return f"{self.effect.name} at {self.effect.at}"
 
     def __str__(self) -> str:
@@ -284,11 +285,11 @@ class EffectShare:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class EffectKernels:
-    """Kernels of a model and the share that each of its effects has in them.
+    """Kernels of a model, and the contribution of each effect to them.
 
     Attributes:
         whole: Kernels with all effects.
-        shares: One per effect, in the order of the mechanism.
+        shares: Contribution of each effect that was switched off, in the order of the mechanism.
     """
 
     whole: Kernels
@@ -335,23 +336,23 @@ def effect_kernels(
 ) -> EffectKernels:
     """Average kernels of a model, and their change when one effect at a time is switched off.
 
-    Effects that every joint has (inertia, spring, motor) are not switched off, nor those that are inactive
-    already. Changes need not add up: a dead zone changes more where friction acts too.
+    Effects that every joint has (inertia, spring, motor) are not switched off, and neither are effects that
+    are inactive already. Changes need not add up: a dead zone changes the kernels more if friction acts too.
 
     Args:
-        model: As in `average_kernels`, and so is what follows.
-        data: Recording or voltage [V]; the same input is used throughout, so most of the noise cancels in
-            the differences.
+        model: This and all other arguments are as in `average_kernels`.
+        data: Recording or voltage [V]; the same input is used with and without an effect, so that most of the
+            noise cancels in the differences.
         channel: Output.
         memory: Number of lags.
-        Ts: Sampling period [s], where `data` is a voltage.
-        reach: Lags of the output derivatives.
-        blocks: Blocks that standard errors come from.
-        mirrored: Average over the voltage and the same with opposite sign.
-        autocovariance: Of the input, where known [V^2].
+        Ts: Sampling period [s], if `data` is a voltage.
+        reach: Number of lags of the output derivatives.
+        blocks: Number of blocks for the standard errors.
+        mirrored: Whether to average over the voltage and the voltage with opposite sign.
+        autocovariance: Autocovariance of the input, if it is known [V^2].
 
     Returns:
-        Kernels of the whole and one row per effect.
+        Kernels of the whole model, and the contribution of each effect.
 
     Raises:
         InputError: As `average_kernels`.
@@ -396,7 +397,7 @@ def _share(effect: Effect, run: AveragingRun, difference: BlockKernels, whole: K
 
 
 def _standardised_change(change: np.ndarray, std: np.ndarray, reference: np.ndarray) -> float:
-    """Root mean square of a change in standard errors; zero or infinite where only rounding scatters."""
+    """Root mean square of a change in standard errors; zero without a change, infinite without scatter."""
     rounding = ROUNDING_SHARE * (np.max(np.abs(reference)) or 1.0)
     if np.max(np.abs(change)) < rounding:
         return 0.0
@@ -405,14 +406,14 @@ def _standardised_change(change: np.ndarray, std: np.ndarray, reference: np.ndar
 
 
 def _size_without_noise(blocks: np.ndarray, size: Any) -> float:
-    """Size of the mean less what the scatter of the blocks adds to it, both squared."""
+    """Size of the mean of the blocks, corrected for the contribution of their scatter to its square."""
     mean = np.mean(blocks, axis=0)
     scatter = np.mean([size(block - mean) ** 2 for block in blocks]) / (len(blocks) - 1)
     return float(np.sqrt(max(size(mean) ** 2 - scatter, 0.0)))
 
 
 def _words(share: float, z: float, unit: str = "") -> str:
-    """A share with its change in standard errors; chance alone is reported as nothing."""
+    """A share with its change in standard errors, in words; a change that may be chance reads "nothing"."""
     if z == 0:
         return "exactly nothing"
     if z < DETECTED_STANDARD_ERRORS:

@@ -1,4 +1,4 @@
-"""The figure of Volterra kernels: linear kernel as stems, quadratic kernel as a map, model beside data."""
+"""Figure of Volterra kernels: linear kernel as stems, quadratic kernel as a map, of model and data."""
 
 from typing import Any
 
@@ -12,9 +12,9 @@ from rotflex_jax.text.colours import FINAL, INK, MEASURED, NO_DATA
 from rotflex_jax.text.numbers import readable
 from rotflex_jax.text.plotting import blank, legend_above, styled
 
-# Differences of so many standard errors have the full colour, so that less than one is pale.
+# Difference [standard errors] with the full colour, so that a difference below one is pale.
 FULL_COLOUR = 5.0
-# A quadratic kernel below so many of its standard errors is chance, and is drawn pale.
+# A quadratic kernel below this number of its standard errors may be chance and is drawn pale.
 MIN_SCALE_STANDARD_ERRORS = 4.0
 
 
@@ -22,17 +22,17 @@ MIN_SCALE_STANDARD_ERRORS = 4.0
 def kernel_figure(
     model: Kernels, data: Kernels | None = None, names: tuple[str, str] = ("model", "data")
 ) -> Figure:
-    """`h1` over the lag and `h2` over two lags; with data also their difference in standard errors.
+    """Figure of `h1` over the lag and `h2` over two lags; with data also of the standardised differences.
 
-    Bars are two standard errors. Maps of model and data share one scale.
+    Bars show two standard errors. Maps of model and data have the same scale.
 
     Args:
         model: Kernels of a physical model.
         data: Identified kernels of the same channel, sampling period and memory.
-        names: What the two are called in the figure.
+        names: Names of `model` and `data` in the figure.
 
     Raises:
-        InputError: The two speak of different things.
+        InputError: Channel, sampling period or memory of `model` and `data` differ.
     """
     if data is None:
         figure = blank(8.0, 3.3)
@@ -58,7 +58,7 @@ def kernel_figure(
 
 
 def _stems(ax: Axes, sets: list[tuple[Kernels, str, str]]) -> None:
-    """Stems side by side, so that equal ones stay both visible."""
+    """Draws stems side by side, so that both sets stay visible where they are equal."""
     scale, unit = readable(1.0, sets[0][0].output_unit)
     for place, (kernels, name, colour) in enumerate(sets):
         shift = 0.24 * kernels.Ts * (place - (len(sets) - 1) / 2)

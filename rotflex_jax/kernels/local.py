@@ -1,4 +1,4 @@
-"""Taylor kernels about a constant voltage, and kernels of a series identified from data."""
+"""Taylor kernels about a constant voltage, and kernels of a series that was identified from data."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -21,7 +21,7 @@ from rotflex_jax.runtime.persistent_jit import persistent_jit
 from rotflex_jax.runtime.xla import double_precision
 
 DIRECTIONS_PER_BATCH = 64
-"""Directions that are differentiated at once: enough for the vector units, few enough for the cache."""
+"""Number of directions of simultaneous derivatives: enough for the vector units, few enough for the cache."""
 
 
 def local_kernels(
@@ -40,24 +40,24 @@ def local_kernels(
 
     The second-order series of a smooth mechanism has an error of third order in the input's deviation. Not
     for dry friction, dead zones and play at rest: a joint that sticks has zero slope there, and a joint that
-    slides at a constant voltage has the slope of the joint without friction. An identification finds
-    `average_kernels` there.
+    slides at a constant voltage has the slope of the joint without friction. With such effects,
+    identification from data finds `average_kernels`.
 
     Args:
         model: Mechanism, or a model with its own integration rule and gates.
         Ts: Sampling period [s]; the voltage is held between samples.
         channel: Output.
         memory: Number of lags M, from 0 to M - 1.
-        voltage: Constant voltage that the series is about [V].
-        settle: How long that voltage acts, from rest, before the kernels are formed [s]; five memories
+        voltage: Constant voltage about which the series is defined [V].
+        settle: Time for which the voltage acts, from rest, before the kernels are computed [s]; five memories
             if None. A motion that continues after that (the angle of a turning hub) is part of `h0`.
-        cubic: Whether to form the diagonal of the cubic kernel too.
+        cubic: Whether to compute the diagonal of the cubic kernel too.
 
     Returns:
         Exact kernels of the simulated model, without standard errors.
 
     Raises:
-        InputError: An unknown channel, no lags, or a period or time that is not positive.
+        InputError: The channel is unknown, there are no lags, or a period or time is not positive.
 
     Source: Rugh, Nonlinear System Theory, 1981, section 3.2 (kernels as Fréchet derivatives).
 
@@ -122,7 +122,7 @@ def _derivatives(
     def last(recent: jax.Array) -> jax.Array:
         """The output at the end as a function of the input, latest sample first."""
         u = jnp.concatenate([before, recent[::-1]])
-        # Actuation may have a memory, so it gets the earlier samples too.
+        # Actuation may have a memory, so it is evaluated on the earlier samples too.
         v = motor_voltage(mechanism, gates, u, Ts)[len(before) :]
         X = states(FreeStep(structure, solver), x0, v, c)
         return read_outputs(mechanism, gates, X[-1])[output]
@@ -150,22 +150,22 @@ def identified_kernels(
     *,
     about: float = 0.0,
 ) -> Kernels:
-    """The kernels that the weights of a fitted Volterra series stand for.
+    """The kernels of a fitted Volterra series, from its weights.
 
     Under a Gaussian input the best linear approximation of a cubic kernel is
-    `3 sum_jl h3[k, j, l] R[j, l]`; it is added to `h1`, so that kernels of bases with and without a cubic
+    `3 sum_jl h3[k, j, l] R[j, l]`. It is added to `h1`, so that kernels of bases with and without a cubic
     degree are comparable.
 
     Args:
-        identified: A fit of a Volterra basis (`least_squares`), whose covariance gives standard errors,
-            or the frozen series alone (an adaptive filter's), which has none.
+        identified: A fit of a Volterra basis (`least_squares`), whose covariance gives standard errors, or a
+            series alone, such as the frozen series of an adaptive filter, which gives none.
         memory: Number of lags; the kernels of an orthonormal basis have infinite length.
-        data: What the series was fitted to, or its input (N,) [V]: sizes are measured with the covariance
-            of this input. Needed for a cubic degree.
+        data: Recordings to which the series was fitted, or its input (N,) [V]. The covariance of this input
+            determines the sizes of the kernels. Needed for a cubic degree.
         about: Level that was subtracted from the input before the fit [V].
 
     Raises:
-        InputError: The basis has a degree above three, or a cubic one and there is no input.
+        InputError: The basis has a degree above three, or a cubic degree without `data`.
 
     >>> from types import SimpleNamespace
     >>> from rotflex_jax.basis import Delays, Volterra
@@ -180,7 +180,7 @@ def identified_kernels(
     spread, words = _input(data, memory, about, series.input_unit)
 
     def orders(w: np.ndarray) -> list[np.ndarray]:
-        """Kernels of degree 0 to 2 of weights, or of a direction of them."""
+        """Kernels of degree 0 to 2 from weights, or from a change of the weights."""
         found = {d: np.asarray(h, float) for d, h in series.basis.kernels(w, memory).items()}
         highest = max(found)
         if highest > 3 or (highest == 3 and spread is None):
@@ -197,7 +197,7 @@ def identified_kernels(
     h0, h1, h2 = orders(np.asarray(series.weights, float))
     std: list[Any] = [0.0, None, None]
     if covariance is not None:
-        # Regressors that a selection left out have no covariance: their weights are zero exactly.
+        # Regressors that a selection left out have no covariance (NaN): their weights are exactly zero.
         sizes, directions = np.linalg.eigh(np.nan_to_num(np.asarray(covariance, float)))
         columns = [orders(d) for d in (directions * np.sqrt(np.maximum(sizes, 0.0))).T]
         std = [np.sqrt(sum(c[d] ** 2 for c in columns)) for d in range(3)]
@@ -222,7 +222,7 @@ def identified_kernels(
 def _input(
     data: Recording | Sequence[Recording] | np.ndarray | None, memory: int, about: float, unit: str
 ) -> tuple[np.ndarray | None, str]:
-    """Covariance of the input over the lags, and the input in words."""
+    """Covariance of the input at the lags, and a description of the input."""
     if data is None:
         return None, ""
     listed = [data] if isinstance(data, (Recording, np.ndarray)) else list(data)

@@ -1,4 +1,4 @@
-"""Kernels of order zero to two of one output, and how well two sets of them agree."""
+"""Kernels of order zero to two of one output, and the agreement of two sets of kernels."""
 
 import dataclasses
 from typing import Any
@@ -21,16 +21,16 @@ class Kernels:
         h0: Output at the level `about` (local), or the constant of the series (average) [output_unit].
         h1: Linear kernel, index = lag in samples [output_unit / input_unit].
         h2: Quadratic kernel, symmetric [output_unit / input_unit^2].
-        about: Input level that the series is about [input_unit].
+        about: Input level about which the series is defined [input_unit].
         kind: "local", "average" or "identified".
-        input: Where the kernels hold, in words.
-        note: A restriction on their use, empty where there is none.
-        covariance: Covariance of the input at the lags [input_unit^2]; None counts as white noise of unit
-            variance where sizes are compared.
-        h0_std: Standard error of `h0`; zero where the derivative is exact.
-        h1_std: Standard errors of `h1`.
-        h2_std: Standard errors of `h2`.
-        h3_diagonal: `h3[k, k, k]` of the cubic kernel [output_unit / input_unit^3], where asked for.
+        input: Input for which the kernels are valid, in words.
+        note: Restriction on the use of the kernels; empty for none.
+        covariance: Covariance of the input at the lags [input_unit^2]; if None, sizes are computed for white
+            noise of unit variance.
+        h0_std: Standard error of `h0`; zero for exact kernels.
+        h1_std: Standard errors of `h1`; None for exact kernels.
+        h2_std: Standard errors of `h2`; None for exact kernels.
+        h3_diagonal: `h3[k, k, k]` of the cubic kernel [output_unit / input_unit^3], or None.
         input_unit: Unit of the input.
         output_unit: Unit of the output.
     """
@@ -64,19 +64,22 @@ class Kernels:
 
     @property
     def spread(self) -> Real[np.ndarray, "M M"]:
-        """Covariance of the input for sizes; the unit matrix where none is known."""
+        """Covariance of the input for sizes; the unit matrix if `covariance` is None."""
         return np.eye(self.memory) if self.covariance is None else self.covariance
 
     @property
     def errors(self) -> tuple[Real[np.ndarray, " M"], Real[np.ndarray, "M M"]]:
-        """Standard errors of `h1` and `h2`, zero where the kernels are exact."""
+        """Standard errors of `h1` and `h2`; zero for exact kernels."""
         M = self.memory
         first = np.zeros(M) if self.h1_std is None else self.h1_std
         return first, np.zeros((M, M)) if self.h2_std is None else self.h2_std
 
     @property
     def sizes(self) -> tuple[float, float]:
-        """Root mean square [output_unit] of the output of each degree under a Gaussian input."""
+        """Size of the linear and of the quadratic part of the output under a Gaussian input [output_unit].
+
+        The linear size is the root mean square, the quadratic size the standard deviation.
+        """
         return linear_size(self.h1, self.spread), quadratic_size(self.h2, self.spread)
 
     def units(self, degree: int) -> str:
@@ -101,7 +104,7 @@ class Kernels:
         )
 
     def response(self, u: Real[np.ndarray, " N"]) -> Float[np.ndarray, " N"]:
-        """Output of the series; before the first sample the input is taken to be `about`.
+        """Output of the series; before its first sample the input is assumed to be `about`.
 
         Args:
             u: Input [input_unit].
@@ -114,7 +117,8 @@ class Kernels:
         """Difference from other kernels in units of their standard errors.
 
         Args:
-            other: Of the same channel, sampling period and memory; converted to this input level.
+            other: Kernels of the same channel, sampling period and memory; they are converted to this input
+                level.
 
         Raises:
             InputError: Channel, sampling period or memory differ.
@@ -155,8 +159,8 @@ class Agreement:
     """Two sets of kernels side by side.
 
     Attributes:
-        first: Usually the model's.
-        second: Usually those identified from data.
+        first: First set, usually the kernels of the model.
+        second: Second set, usually the kernels identified from data.
     """
 
     first: Kernels
@@ -164,23 +168,23 @@ class Agreement:
 
     @property
     def z1(self) -> Float[np.ndarray, " M"]:
-        """Difference of `h1` over its standard error; NaN where neither has one."""
+        """Difference of `h1` over its standard error; NaN where neither set has one."""
         return _over(self.first.h1 - self.second.h1, self.first.errors[0], self.second.errors[0])
 
     @property
     def z2(self) -> Float[np.ndarray, "M M"]:
-        """Difference of `h2` over its standard error; NaN where neither has one."""
+        """Difference of `h2` over its standard error; NaN where neither set has one."""
         return _over(self.first.h2 - self.second.h2, self.first.errors[1], self.second.errors[1])
 
     @property
     def rms(self) -> tuple[float, float]:
-        """Root mean square of `z1` and `z2`: about one where the two differ by chance only."""
+        """Root mean square of `z1` and of `z2`: about one if the two sets differ by chance only."""
         upper = self.z2[np.triu_indices(len(self.z2))]
         return root_mean_square(self.z1), root_mean_square(upper)
 
     @property
     def relative(self) -> tuple[float, float]:
-        """Size of the differences of `h1` and `h2`, each as a share of the second's linear response."""
+        """Sizes of the differences of `h1` and `h2`, as shares of the linear response of the second set."""
         whole = self.second.sizes[0] or 1.0
         spread = self.second.spread
         first = linear_size(self.first.h1 - self.second.h1, spread)
@@ -207,7 +211,7 @@ def quadratic_size(h2: Real[np.ndarray, "M M"], covariance: Real[np.ndarray, "M 
 
 
 def root_mean_square(z: Float[np.ndarray, "..."]) -> float:
-    """Root mean square of the finite entries; zero where there are none."""
+    """Root mean square of the finite entries; zero if there are none."""
     finite = z[np.isfinite(z)]
     return float(np.sqrt(np.mean(finite**2))) if finite.size else 0.0
 

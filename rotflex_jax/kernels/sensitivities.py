@@ -1,8 +1,8 @@
 """Derivatives of a model's output with respect to each of its last input samples.
 
 A trajectory `x[t+1] = F(x[t], v[t])` has the Jacobians `A[t] = dF/dx`, `B[t] = dF/dv`, which follow from the
-states alone and are formed for all samples at once. The response to the voltage k samples ago is
-`A[t-1] ... A[t-k+1] B[t-k]`, a recursion over the lag that treats all samples side by side.
+states and are computed for all samples at once. The response to the voltage k samples ago is
+`A[t-1] ... A[t-k+1] B[t-k]`. It is computed by a recursion over the lag, for all samples in parallel.
 """
 
 from collections.abc import Callable
@@ -40,7 +40,7 @@ class Modelled(Protocol):
 
     @property
     def gates(self) -> tuple[float, ...] | None:
-        """Factor of each effect."""
+        """Gate of each effect; None if all effects are on."""
         ...
 
 
@@ -50,7 +50,7 @@ class OutputModel(NamedTuple):
     Attributes:
         mechanism: The physics.
         solver: Integration rule.
-        gates: One factor per effect.
+        gates: Gate of each effect.
         output: Index of the output.
     """
 
@@ -66,10 +66,10 @@ class OutputModel(NamedTuple):
 
 
 def output_model(model: Mechanism | Modelled, channel: str) -> OutputModel:
-    """One output of a model; a bare mechanism is integrated by one exponential step per sample.
+    """One output of a model; a mechanism alone is integrated by one exponential step per sample.
 
     Raises:
-        InputError: The mechanism has no such output.
+        InputError: The mechanism has no such output, or its voltage is not held between samples.
     """
     if isinstance(model, Mechanism):
         mechanism, solver, given = model, Exponential(), None
@@ -95,7 +95,7 @@ def lags_of(memory: int) -> int:
     """The number of lags as an integer.
 
     Raises:
-        InputError: Not a whole number of at least one lag.
+        InputError: `memory` is not a whole number, or is below one.
     """
     return whole(memory, "memory", 1)
 
@@ -112,15 +112,15 @@ def output_derivatives(
     u: Float[Array, " N"],
     Ts: Float[Array, ""],
 ) -> tuple[Float[Array, " N"], Float[Array, "reach N"]]:
-    """The output and its derivatives `dy[t] / du[t-k]`; those with t < k are undefined.
+    """The output and its derivatives `dy[t] / du[t-k]`; derivatives with t < k are undefined.
 
     Args:
         structure: `mechanism.structure`; static.
         solver: Integration rule; static.
         output: Index of the output; static.
-        reach: Number of lags, from 0; static.
+        reach: Number of lags, from 0 to reach - 1; static.
         values: Parameter values.
-        gates: One factor per effect.
+        gates: Gate of each effect.
         x0: First state.
         u: Voltage [V].
         Ts: Sampling period [s].
@@ -133,7 +133,7 @@ def output_derivatives(
     read = lambda x: read_outputs(mechanism, gates, x)[output]  # noqa: E731
 
     def local(here: Any) -> tuple[Array, ...]:
-        """The output, derivatives of the next state by states and voltage, and derivatives of the output."""
+        """Output, derivatives of the next state by state and voltage, derivatives of the output by state."""
         x, w = here
         size = len(x0) + 1
         units = jnp.broadcast_to(jnp.eye(size, dtype=x.dtype)[:, :, None], (size, size, len(w)))
@@ -146,10 +146,10 @@ def output_derivatives(
     A, B = AB[:-1], AB[-1]
 
     def next_lag(dx: Array, _: None) -> tuple[Array, Array]:
-        """From the state's response to the voltage k samples ago to that k + 1 samples ago."""
+        """From the response of the state to the voltage k samples ago to its response k + 1 samples ago."""
         return jnp.roll(jnp.sum(A * dx[:, None], axis=0), 1, axis=1), jnp.sum(row * dx, axis=0)
 
-    # The voltage of a sample acts on the next state first.
+    # The voltage of a sample acts on the next state at the earliest, so the response at lag 0 is zero.
     later = jax.lax.scan(next_lag, jnp.roll(B, 1, axis=1), None, length=reach)[1]
     responses = jnp.concatenate([jnp.zeros_like(later[:1]), later[: reach - 1]])
     if effects_of(mechanism, Actuation):
@@ -158,7 +158,7 @@ def output_derivatives(
 
 
 def _by_command(mechanism: Mechanism, gates: Array, u: Array, Ts: Array, responses: Array) -> Array:
-    """Responses to the commanded voltage from those to the motor's voltage.
+    """Responses to the commanded voltage, from the responses to the motor's voltage.
 
     dy[t] / du[t-k] = sum_m dy[t] / dv[t-k+m]  dv[t-k+m] / du[t-k]
     """
@@ -166,7 +166,7 @@ def _by_command(mechanism: Mechanism, gates: Array, u: Array, Ts: Array, respons
     slope = lambda e: jax.jvp(drive, (u,), (e,))[1]  # noqa: E731
     at = jnp.arange(len(u))[None, :] - jnp.arange(len(responses))[:, None]
     own, probe = slope(jnp.ones_like(u)), jax.random.normal(jax.random.key(0), u.shape, u.dtype)
-    # The output of an actuator without memory depends on the sample of the same time only.
+    # The output of an actuator without memory depends on its input at the same sample only.
     at_once = jnp.allclose(slope(probe), own * probe, rtol=1e-9, atol=1e-12)
     return jax.lax.cond(at_once, lambda: responses * own[at], lambda: _convolved(slope, u, at, responses))
 
@@ -174,15 +174,15 @@ def _by_command(mechanism: Mechanism, gates: Array, u: Array, Ts: Array, respons
 def _convolved(slope: Callable[[Array], Array], u: Array, at: Array, responses: Array) -> Array:
     """The sum of `_by_command` over all m below `reach`.
 
-    The derivatives of the actuator come from impulse trains of the period `reach`, so that the responses to
-    single impulses do not overlap: a sample belongs to the latest impulse.
+    The derivatives of the actuator are computed with impulse trains of the period `reach`. The responses to
+    the impulses do not overlap, so a sample belongs to the latest impulse.
     """
     reach, time = len(responses), jnp.arange(len(u))
     trains = jax.lax.map(lambda p: slope((time % reach == p).astype(u.dtype)), jnp.arange(reach))
     lag = jnp.arange(reach)[:, None]
 
     def add(m: Array, total: Array) -> Array:
-        """Adds the part that reaches the motor m samples after its command."""
+        """Adds the contribution of a command that reaches the motor m samples later."""
         moved = jnp.roll(responses * trains[(at - m) % reach, at], m, axis=0)
         return total + jnp.where(lag >= m, moved, 0.0)
 

@@ -11,13 +11,13 @@ from rotflex_jax.text.colours import BASELINE, FAINT, FINAL, MUTED
 from rotflex_jax.text.numbers import readable
 from rotflex_jax.text.plotting import blank, legend_above, styled, thinned
 
-# The scale of a torque is at least this share of the motor's torque, so that noise is drawn small.
+# The axis of a torque spans at least this share of the motor's torque, so that noise is drawn small.
 MIN_SCALE_OF_MOTOR = 0.01
 
 
 @styled
 def latent_maps(before: LatentTorque, after: LatentTorque | None = None) -> Figure:
-    """Mean torque at each port over speed and position, without and with what damper and spring took over."""
+    """Mean torque at each port over speed and position, without and with shares of damper and spring."""
     figure = blank(10.0, 2.5 * len(before.ports) + 0.4)
     grid = figure.subplots(len(before.ports), 4, squeeze=False)
     floor = MIN_SCALE_OF_MOTOR * before.scale
@@ -49,7 +49,11 @@ def latent_maps(before: LatentTorque, after: LatentTorque | None = None) -> Figu
 def _with_terms(
     torque: LatentTorque, terms: list[str], before: LatentTorque, after: LatentTorque | None
 ) -> LatentTorque:
-    """The torque with what the baseline's terms took over; without a better model, with all of them."""
+    """The baseline's torque plus the share of its damper or spring that compensates for the missing effect.
+
+    The share is the difference from the same terms of the better model `after`; without such a model, the
+    whole torques of the terms are added. The torque of the better model itself is returned unchanged.
+    """
     if not terms or (after is not None and torque is not before):
         return torque
     return torque.given_back(*terms, beyond=after)
@@ -57,7 +61,7 @@ def _with_terms(
 
 @styled
 def latent_time(before: LatentTorque, after: LatentTorque | None = None) -> Figure:
-    """The torque at each port in time, with its band, and by frequency."""
+    """The torque at each port over time, with its band, and over frequency."""
     figure = blank(10.0, 2.1 * len(before.ports) + 0.5)
     grid = figure.subplots(len(before.ports), 2, squeeze=False, width_ratios=(1.7, 1.0), sharex="col")
     last = before.recording == before.recording[-1]
@@ -104,7 +108,7 @@ def _styles(before: LatentTorque, after: LatentTorque | None) -> list[tuple[Late
 
 
 def _curve(ax: Axes, torque: LatentTorque, port: str, against: Abscissa, style: dict[str, Any]) -> None:
-    """A binned mean with its band, over what scatters about it."""
+    """Draw a binned mean with its band and, for the baseline, with the spread of single samples."""
     c = torque.curve(port, against)
     scale, read = readable(1.0, c.unit)
     at = scale * c.at

@@ -1,4 +1,4 @@
-"""A latent torque read in time: lines of a periodic disturbance, and a slow drift."""
+"""Behaviour of a latent torque over time: spectral lines of a periodic disturbance, and a slow drift."""
 
 import math
 from typing import NamedTuple
@@ -9,32 +9,33 @@ from jaxtyping import Bool, Float
 
 from rotflex_jax.parameters import HALF_WIDTH_95
 
-# Chance of a false line, and of a false drift, in one torque.
+# Probability of a false line, and of a false drift, in one torque.
 FALSE_ALARM = 1e-3
-# A line has at least so many periods in its recording; what is slower is drift.
+# Least number of periods of a line in its recording; anything slower counts as drift.
 LEAST_PERIODS = 8
-# Share of the Nyquist frequency above which the level is not known from both sides.
+# Share of the Nyquist frequency up to which lines are sought: above it, the level lacks neighbours on one
+# side.
 BELOW_NYQUIST = 0.9
-# Neighbours on either side from which the level of the spectrum about a frequency is taken.
+# Number of neighbours on either side of a frequency from which the level of the spectrum is estimated.
 NEIGHBOURS = 40
-# Degree of the curve that follows the spectrum of a torque, in logarithms of both.
+# Degree of the polynomial that follows the spectrum of a torque, in logarithms of both.
 SMOOTH_DEGREE = 6
-# Blocks of a recording whose means tell a drift.
+# Number of blocks of a recording whose means are tested for a drift.
 DRIFT_BLOCKS = 12
-# An input that correlates as much as this with itself a while later repeats itself.
+# An input counts as periodic if its autocorrelation at some lag exceeds this.
 REPEATS = 0.8
-# Most lines that are looked for in one torque.
+# Largest number of lines that are sought in one torque.
 MOST_LINES = 5
 
 
 class PeriodicTorque(NamedTuple):
-    """A sine in a torque that is none of the input.
+    """A sine in a torque that is not caused by the input.
 
     Attributes:
-        frequency: [Hz].
-        amplitude: [unit of the torque].
+        frequency: Frequency [Hz].
+        amplitude: Amplitude [unit of the torque].
         interval: 95 % interval of the amplitude.
-        p_value: Chance of such a line in a torque without any.
+        p_value: Probability of such a line in a torque without lines.
     """
 
     frequency: float
@@ -47,10 +48,10 @@ class Drift(NamedTuple):
     """A torque that rises or falls over its recording.
 
     Attributes:
-        slope: [unit of the torque per second].
+        slope: Slope [unit of the torque per second].
         interval: 95 % interval of the slope.
-        change: Over the whole recording [unit of the torque].
-        p_value: Chance of such a slope without drift.
+        change: Change over the whole recording [unit of the torque].
+        p_value: Probability of such a slope without drift.
     """
 
     slope: float
@@ -66,17 +67,17 @@ def periodic_torques(
 
         p = 1 - (1 - (1 + P / (n B))^-n)^M
 
-    with the largest ordinate P of the tapered periodogram over the mean level B about it, taken from n
-    neighbours, and M frequencies: Fisher's test for a hidden period, with a level that may change with the
-    frequency, as that of a latent torque does. A line that is found is taken away and the test repeated.
-    Torques of the motion repeat with the input: multiples of its frequency, where it repeats itself, and its
-    own lines are left out.
+    `P` is the ordinate of the tapered periodogram with the largest ratio to the mean level `B` around it. The
+    level is estimated from `n` neighbours, and `M` is the number of frequencies. This is Fisher's test for a
+    hidden period, with a level that may change with the frequency, as in the spectrum of a latent torque. A
+    line that is found is removed, and the test is repeated. Torques that depend on the motion are periodic if
+    the input is. So lines of the input are left out, and for a periodic input all multiples of its frequency.
 
-    Not for a machine under feedback, whose input answers to a disturbance, nor for one that turns evenly,
-    where a torque of the position has lines too.
+    Do not use it for a machine under feedback, whose input responds to a disturbance, or for a machine that
+    turns at constant speed, where a torque that depends on the position has lines too.
 
     Args:
-        torque: [N m].
+        torque: Torque [N m].
         u: Input.
         Ts: Sampling period [s].
 
@@ -99,7 +100,7 @@ def periodic_torques(
         level = _level(power)
         ratio = np.where(usable, power / level, 0.0)
         k = int(np.argmax(ratio))
-        # The level is itself an estimate, by about as many ordinates as there are neighbours on one side.
+        # The level is an estimate too, with about as many ordinates as there are neighbours on one side.
         tail = (1 + float(ratio[k]) / NEIGHBOURS) ** -NEIGHBOURS
         p = -math.expm1(M * math.log1p(-tail)) if tail < 1 else 1.0
         if p > FALSE_ALARM:
@@ -110,15 +111,15 @@ def periodic_torques(
         interval = (max(amplitude - HALF_WIDTH_95 * std, 0.0), amplitude + HALF_WIDTH_95 * std)
         found.append(PeriodicTorque(frequency, amplitude, interval, p))
         left = left - sine
-        usable &= np.abs(f - frequency) > 2.5 * f[1]  # what is left of a line is none
+        usable &= np.abs(f - frequency) > 2.5 * f[1]  # the rest of a removed line is no further line
     return tuple(sorted(found, key=lambda line: -line.amplitude))
 
 
 def drift(torque: Float[np.ndarray, " N"], Ts: float) -> Drift | None:
-    """The slope of a torque over its recording, by a regression of means over blocks; None if there is none.
+    """The slope of a torque over its recording, by a regression of means over blocks; None without a drift.
 
     Args:
-        torque: [N m].
+        torque: Torque [N m].
         Ts: Sampling period [s].
     """
     N = len(torque) - len(torque) % DRIFT_BLOCKS
@@ -135,11 +136,11 @@ def drift(torque: Float[np.ndarray, " N"], Ts: float) -> Drift | None:
 
 
 def _usable(u: Float[np.ndarray, " N"], f: Float[np.ndarray, " F"], Ts: float) -> Bool[np.ndarray, " F"]:
-    """Frequencies at which a line is none of the input: where it has no line, nor multiples of its period."""
+    """Frequencies at which a line is not caused by the input, which has no line or harmonic there."""
     usable = (f * len(u) * Ts >= LEAST_PERIODS) & (f < BELOW_NYQUIST / (2 * Ts))
     power = _periodogram(_without_trend(u))
     lines = power > _level(power) * math.log(len(f) / FALSE_ALARM)
-    # The taper widens a line to its neighbours.
+    # The taper spreads a line over neighbouring frequencies.
     usable &= ~(scipy.ndimage.maximum_filter1d(lines.astype(int), 5) > 0)
     if period := _period(u):
         order = f * period * Ts
@@ -148,14 +149,14 @@ def _usable(u: Float[np.ndarray, " N"], f: Float[np.ndarray, " F"], Ts: float) -
 
 
 def _period(u: Float[np.ndarray, " N"]) -> int:
-    """Samples after which an input repeats itself; 0 where it does not."""
+    """Period of an input in samples; 0 if it is not periodic."""
     x, N = u - u.mean(), len(u)
     size = 1 << (2 * N - 1).bit_length()
     own = np.fft.irfft(np.abs(np.fft.rfft(x, size)) ** 2, size)[: N // 2]
     if own[0] <= 0:
         return 0
     share = own / own[0] * N / (N - np.arange(len(own)))
-    below = np.flatnonzero(share < 0.5)  # the first peak is that at no lag
+    below = np.flatnonzero(share < 0.5)  # skips the peak at lag zero
     if not len(below):
         return 0
     k = int(below[0] + np.argmax(share[below[0] :]))
@@ -163,23 +164,23 @@ def _period(u: Float[np.ndarray, " N"]) -> int:
 
 
 def _without_trend(x: Float[np.ndarray, " N"]) -> Float[np.ndarray, " N"]:
-    """A signal less its regression line."""
+    """A signal without its regression line."""
     t = np.arange(len(x)) - (len(x) - 1) / 2
     centred = x - x.mean()
     return centred - t * (t @ centred) / max(t @ t, 1e-300)
 
 
 def _periodogram(x: Float[np.ndarray, " N"]) -> Float[np.ndarray, " F"]:
-    """Of a tapered signal; of white noise the variance, in the mean."""
+    """Periodogram of a tapered signal; its mean for white noise is the variance."""
     w = np.sin(np.pi * np.arange(len(x)) / len(x)) ** 2
     return np.abs(np.fft.rfft(w * x)) ** 2 / np.sum(w**2)
 
 
 def _level(power: Float[np.ndarray, " F"]) -> Float[np.ndarray, " F"]:
-    """Mean level about each frequency, from the median, which a line does not move.
+    """Mean level around each frequency, from the median of neighbours, which a line hardly changes.
 
-    The median of neighbouring ordinates is that of an exponential distribution, ln 2 of its mean. Where the
-    level falls steeply, neighbours differ: a smooth curve through the logarithms is taken off before.
+    Ordinates have an exponential distribution, whose median is ln 2 times its mean. Where the level falls
+    steeply, neighbours differ, so a smooth curve through the logarithms is subtracted first.
     """
     y = np.log(np.maximum(power, 1e-12 * max(float(power.max()), 1e-300)))
     x = np.log1p(np.arange(len(y)))
@@ -201,7 +202,7 @@ def _harmonic(
         waves = _waves(t, frequency)
         return float(np.sum((x - waves @ np.linalg.lstsq(waves, x, rcond=None)[0]) ** 2))
 
-    # Within a step the sum of squares has one minimum, about the crest of the line.
+    # Within one step the sum of squares has one minimum, near the peak of the line.
     grid = np.linspace(near - step, near + step, 9)
     best = float(grid[int(np.argmin([left(v) for v in grid]))])
     found = scipy.optimize.minimize_scalar(left, bounds=(best - step / 4, best + step / 4), method="bounded")

@@ -1,4 +1,4 @@
-"""The latent torque as a result: torques with bands, binned curves, spectra."""
+"""The result of a latent-torque estimation: torques with bands, binned curves, spectra."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -25,11 +25,11 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-# Bins with fewer samples are left out.
+# Least number of samples of a bin; bins with fewer are left out.
 MIN_SAMPLES_PER_BIN = 8
-# A torque is read in time where it gains at least this [nat]; below it is what the smoother starts from.
+# Least gain of a torque that is examined for behaviour in time [nat]; with less, it may be the prior alone.
 ASKED_FOR = 10.0
-# Number of stays in a bin that the variance over all bins counts as.
+# Weight of the variance over all bins in the variance of one bin, in stays.
 PRIOR_STAYS = 3
 
 
@@ -39,15 +39,15 @@ class TorqueCurve:
 
     Attributes:
         at: Mean of the abscissa in each bin.
-        mean: Mean torque [N m].
-        low: Lower end of the 95 % band of that mean [N m].
-        high: Upper end [N m].
+        mean: Mean torque in each bin [N m].
+        low: Lower end of the 95 % band of this mean [N m].
+        high: Upper end of the band [N m].
         spread: Standard deviation of single samples about the mean [N m].
-        count: Samples in each bin.
-        visits: Separate stays in each bin.
+        count: Number of samples in each bin.
+        visits: Number of separate stays in each bin.
         against: Name of the abscissa.
-        unit: Of the abscissa.
-        port: Where the torque acts.
+        unit: Unit of the abscissa.
+        port: Port at which the torque acts.
     """
 
     at: Float[np.ndarray, " B"]
@@ -69,15 +69,16 @@ def binned_mean(
     bins: int,
     segment: Int[np.ndarray, " N"],
 ) -> dict[str, Float[np.ndarray, " B"] | Int[np.ndarray, " B"]]:
-    """Fields of a curve.
+    """Mean of a torque in bins of an abscissa, as fields of a `TorqueCurve`.
 
     Neighbouring samples are correlated, so a stay in a bin, from entering to leaving it, counts as one
-    observation. Bins are equally wide between the 1 % and 99 % quantiles; the outermost take in the rest.
+    observation. Bins are equally wide between the 1 % and 99 % quantiles; the outermost bins contain the
+    rest.
 
     Args:
         x: Abscissa.
-        torque: [N m].
-        std: Its standard deviation [N m].
+        torque: Torque [N m].
+        std: Standard deviation of the torque [N m].
         bins: Number of bins.
         segment: Number of the recording of each sample.
     """
@@ -93,7 +94,7 @@ def binned_mean(
     each = np.maximum(count, 1.0)
     mean, own, at = (np.bincount(which, w, bins) / each for w in (torque, std**2, x))
     scatter = np.bincount(which, (torque - mean[which]) ** 2, bins) / each
-    # Variance of the means of stays about that of their bin; with few stays, towards that of all bins.
+    # Variance of the means of stays about the mean of their bin; with few stays, nearer to that of all bins.
     squares = length * (np.bincount(stay, torque) / length - mean[bin_of]) ** 2
     pooled = squares.sum() / max(count[visits > 1].sum(), 1.0)
     between = visits * np.bincount(bin_of, squares, bins) / each + PRIOR_STAYS * pooled
@@ -116,27 +117,27 @@ CURVE_BINS = 40
 
 @dataclasses.dataclass(frozen=True)
 class LatentTorque:
-    """Torques that a model lacks, along its recordings, one after the other.
+    """Torques that a model lacks, along all samples of its recordings.
 
     Attributes:
-        ports: Where the torques act, D of them.
-        torque: Mean given all samples [N m].
-        std: Standard deviation about it [N m].
-        time: [s].
-        position: Of each port [rad].
-        speed: Of each port [rad/s].
-        voltage: [V].
+        ports: The D ports at which the torques act.
+        torque: Mean of the torque at each port, given all samples [N m].
+        std: Standard deviation of the torque, given all samples [N m].
+        time: Time of each sample [s].
+        position: Position of each port [rad].
+        speed: Speed of each port [rad/s].
+        voltage: Input [V].
         recording: Number of the recording of each sample.
         Ts: Sampling period of each recording [s].
         intensity: Port -> intensity of the torque, a random walk [(N m)^2/s].
-        gain_nats: Port -> log-likelihood that its torque gains over none [nat].
+        gain_nats: Port -> log-likelihood that its torque gains over no torque [nat].
         scale: Torque that the motor gives at the root mean square voltage [N m].
-        linear: Torques of the model's own dampers and springs at these ports, `port.effect` ->
-            torque [N m]; what `given_back` can add.
+        linear: `port.effect` -> torque of a damper or spring of the model at these ports [N m], which
+            `given_back` can add.
         motion: Unit of positions.
         input: Unit of the input.
         effort: Unit of torques.
-        added: Which of them are in `torque`.
+        added: Names of the torques in `linear` that are included in `torque`.
     """
 
     ports: tuple[str, ...]
@@ -158,15 +159,15 @@ class LatentTorque:
     added: tuple[str, ...] = ()
 
     def given_back(self, *names: str, beyond: "LatentTorque | None" = None) -> "LatentTorque":
-        """The torque together with that of some of the model's own dampers and springs.
+        """The torque plus the torques of some of the model's own dampers and springs.
 
-        A fitted damper has its true part and a part that it took over from the missing effect; only
-        their sum with the torque acts on the machine.
+        A fitted damper compensates for a part of the missing effect, in addition to the true damping. Only
+        the sum of the damper's torque and the latent torque is determined.
 
         Args:
             names: `port.effect`, for instance "hub.viscous"; all dampers if none is named.
-            beyond: Torques of the same recordings under a better model: then only what these terms give
-                beyond the same terms there is added.
+            beyond: Latent torques of the same recordings with a better model. Then only the difference
+                between the torques of these effects in the two models is added.
         """
         chosen = names or tuple(n for n in self.linear if n.endswith(".viscous"))
         torque = self.torque.copy()
@@ -186,11 +187,11 @@ class LatentTorque:
     def curve(self, port: str, against: Abscissa = "speed", bins: int = CURVE_BINS) -> TorqueCurve:
         """Mean of the torque at a port in bins, with a 95 % band.
 
-        The band is that of the mean, each stay in a bin counting once; what the model's own terms took
-        over is not in it.
+        The band is about the mean, and each stay in a bin counts as one observation. The part of the missing
+        effect that the model's own parameters compensate for is not in the curve.
 
         Args:
-            port: Which torque.
+            port: Port of the torque.
             against: Speed or position of the port, deflection of the joint's spring, voltage or time.
             bins: Number of bins.
         """
@@ -239,17 +240,20 @@ class LatentTorque:
         return f[1:], np.sqrt(density[1:])
 
     def periodic(self, port: str) -> tuple[PeriodicTorque, ...]:
-        """Sines of the longest recording that the input has not; see `latent.in_time.periodic_torques`."""
+        """Sines in the torque that the input lacks; see `latent.in_time.periodic_torques`.
+
+        They are sought in the longest recording. There are none if the torque gains too little.
+        """
         own = self._longest()
         return self._if_there(port, periodic_torques, self.voltage[own], self._period_of(own)) or ()
 
     def drift(self, port: str) -> Drift | None:
-        """The rise or fall of a torque over the longest recording; None where there is none."""
+        """Slow rise or fall of a torque over the longest recording; None if there is none."""
         own = self._longest()
         return self._if_there(port, drift, self._period_of(own))
 
     def in_time(self) -> list[str]:
-        """What the torques do in time, in sentences: periodic disturbances and slow drifts."""
+        """Sentences on the torques over time: periodic disturbances and slow drifts."""
         said = []
         for port in self.ports:
             for line in self.periodic(port):
@@ -275,17 +279,17 @@ class LatentTorque:
         return self.Ts[int(self.recording[samples][0])]
 
     def _if_there(self, port: str, read: Callable[..., Any], *given: Any) -> Any:
-        """What is read of a torque over the longest recording; None of one that the data do not ask for."""
+        """A function of a torque over the longest recording; None if the torque gains too little."""
         i = self._index(port)
         if self.gain_nats[port] < ASKED_FOR:
             return None
         return read(self.torque[self._longest(), i], *given)
 
     def plot(self, after: "LatentTorque | None" = None) -> "Figure":
-        """The torques over speed, without and with the dampers given back, and over position.
+        """Figure of the torques over speed, without and with the dampers' torques added, and over position.
 
         Args:
-            after: The torques that a better model leaves on the same recordings, drawn beside.
+            after: Latent torques of a better model over the same recordings, drawn as well.
         """
         from rotflex_jax.latent.figure import latent_maps  # the layer above, on request
 
@@ -300,7 +304,7 @@ class LatentTorque:
         return self.ports.index(port)
 
     def _repr_html_(self) -> str:
-        """Size and evidence of the torque at each port, and its mean over the speed of the port."""
+        """A card with size and gain of the torque at each port, and its mean over the speed of the port."""
         rows = [(p, plain_number(self.size(p)), plain_number(self.gain_nats[p])) for p in self.ports]
         drawn = []
         for port in self.ports:
@@ -332,7 +336,7 @@ def latent_torque_result(
     nats: Float[np.ndarray, " D"],
     scale: float,
 ) -> LatentTorque:
-    """A result from smoothed states and their standard deviations, intensities and gains per port."""
+    """The result from smoothed states with their standard deviations, and intensity and gain of each port."""
     S, std = (np.concatenate([s[: r.N] for s, r in zip(a, recordings, strict=True)]) for a in states)
     m, n, D = model.mechanism, len(model.mechanism.coordinates), len(ports)
     vectors = np.array([m.port_vectors[p] for p in ports]).T
@@ -360,7 +364,7 @@ def latent_torque_result(
 def _linear_torques(
     m: Mechanism, ports: tuple[str, ...], position: np.ndarray, speed: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """Torques of dampers and springs at the ports."""
+    """`port.effect` -> torque of each damper and spring at the ports [N m]."""
     found = {}
     for _, e in effects_of(m, Linear):
         if e.motor or e.order or e.at not in ports:

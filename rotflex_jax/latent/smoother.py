@@ -2,9 +2,9 @@
 
     s[k+1] = A[k] s[k] + c[k] + w,   y[k] = H[k] s[k] + g[k] + v
 
-The channels of a sample are processed one after the other, so that no matrix is inverted; covariances are
-updated in Joseph's form. The backward pass is that of Bryson and Frazier: it equals the one of Rauch, Tung
-and Striebel where that exists, and also holds where the process noise is singular, as it is here.
+The channels of a sample are processed one after the other, so that no matrix is inverted. Covariances are
+updated in Joseph's form. The backward pass is the smoother of Bryson and Frazier. It equals the smoother of
+Rauch, Tung and Striebel where that exists, and also holds if the process noise is singular, as it is here.
 
 Source: G. J. Bierman, Factorization Methods for Discrete Sequential Estimation, 1977, chapters 2 and 10.
 """
@@ -32,9 +32,9 @@ class LinearTimeVaryingModel(NamedTuple):
     """A linear model along one recording, along several, or at one sample.
 
     Attributes:
-        A: Transitions.
-        c: Their constant parts.
-        H: Output rows.
+        A: Transition matrices.
+        c: Constant parts of the transitions.
+        H: Output matrices.
         y: Measured outputs less their constant parts.
         seen: One where a sample counts.
     """
@@ -47,14 +47,14 @@ class LinearTimeVaryingModel(NamedTuple):
 
 
 class InitialDistribution(NamedTuple):
-    """First state of one recording or of several: its mean and its variances."""
+    """Mean and variances of the first state, of one recording or of several."""
 
     mean: Float[Array | np.ndarray, "*batch m"]
     variance: Float[Array | np.ndarray, "*batch m"]
 
 
 class _ChannelUpdate(NamedTuple):
-    """What the backward pass needs of one channel: gain, innovation, its variance."""
+    """Gain, innovation and its variance of one channel, for the backward pass."""
 
     gain: jax.Array
     e: jax.Array
@@ -62,7 +62,7 @@ class _ChannelUpdate(NamedTuple):
 
 
 def _product(A: jax.Array, B: jax.Array) -> jax.Array:
-    """`A @ B` as multiply and add, which the compiler fuses into the loop."""
+    """`A @ B` as a sum of products, which the compiler fuses into the loop."""
     return jnp.sum(A[:, :, None] * B[None], axis=1)
 
 
@@ -73,7 +73,7 @@ def _times(A: jax.Array, x: jax.Array) -> jax.Array:
 def _measurement_update(
     m: jax.Array, P: jax.Array, H: jax.Array, y: jax.Array, seen: jax.Array, noise: jax.Array
 ) -> tuple[jax.Array, jax.Array, list[_ChannelUpdate]]:
-    """Mean and covariance after the channels of one sample."""
+    """Mean and covariance after the update with the channels of one sample."""
     updates = []
     for c in range(H.shape[0]):
         h, r = H[c], noise[c] ** 2
@@ -104,9 +104,9 @@ def log_likelihood(
     """Log-likelihood of one recording [nat].
 
     Args:
-        model: Along the recording.
-        start: First state.
-        noise: Standard deviation of the sensor noise per channel.
+        model: Linear model along the recording.
+        start: Distribution of the first state.
+        noise: Standard deviation of the sensor noise of each channel.
         Q: Variance that the process noise adds to each state per sample.
     """
 
@@ -136,7 +136,7 @@ def fixed_interval_smoother(
     _, filtered = jax.lax.scan(forward, (start.mean, jnp.diag(start.variance)), model)
 
     def backward(carry: Any, row: Any) -> Any:
-        # Gradient and curvature of the negative log-likelihood of all later samples, along the state.
+        # Gradient and curvature of the negative log-likelihood of all later samples, by the state.
         gradient, curvature = carry
         at, (m, P, updates) = row
         gradient, curvature = _times(at.A.T, gradient), _product(_product(at.A.T, curvature), at.A)
@@ -155,7 +155,7 @@ def fixed_interval_smoother(
     return jax.lax.scan(backward, zero, (model, filtered), reverse=True)[1]
 
 
-# The search ends when a change of the intensities by this factor no longer raises the likelihood.
+# The search ends when changes of the intensities by this factor no longer increase the likelihood.
 LATTICE_TOLERANCE = 1.2
 
 _log_likelihoods = jax.jit(jax.vmap(jax.vmap(log_likelihood, (0, 0, None, 0)), (None, None, None, 0)))
@@ -164,15 +164,15 @@ _smooth_recordings = jax.jit(jax.vmap(fixed_interval_smoother, (0, 0, None, 0)))
 
 @dataclasses.dataclass(frozen=True)
 class IntensityEstimator:
-    """Maximum likelihood of the process-noise intensities of unknown torques. Call it in double precision.
+    """Maximum-likelihood estimator of the intensities of unknown torques; to be called in double precision.
 
     Attributes:
-        noise: Standard deviation of the sensor noise per channel.
-        variance_growth: Variance that one sample adds to a torque of unit intensity, by recording [s].
-        time_constant: Time over which a torque decays [s].
+        noise: Standard deviation of the sensor noise of each channel.
+        variance_growth: Variance that one sample adds to a torque of unit intensity, for each recording [s].
+        time_constant: Time constant with which a torque decays [s].
         smallest: Lower bound of the intensities [(N m)^2/s].
-        largest: Upper bound [(N m)^2/s].
-        states: States of the mechanism, ahead of the torques.
+        largest: Upper bound of the intensities [(N m)^2/s].
+        states: Number of states of the mechanism, which come before the torques.
         torques: Number of unknown torques.
     """
 
@@ -188,7 +188,7 @@ class IntensityEstimator:
         self, model: LinearTimeVaryingModel, start: InitialDistribution, levels: Float[np.ndarray, "L D"]
     ) -> Float[np.ndarray, " L"]:
         """Log-likelihoods of several sets of intensities [nat]."""
-        # The torque of the first sample is as uncertain as that of any other; one wide variance serves all.
+        # The torque at the first sample is as uncertain as at any other. All sets use the largest variance.
         first = self._with_torque_variance(start, levels.max(axis=0))
         Q = jnp.asarray(self._process_noise(levels))
         return np.asarray(_log_likelihoods(model, first, jnp.asarray(self.noise), Q)).sum(axis=1)
@@ -211,9 +211,9 @@ class IntensityEstimator:
         """Intensities of largest likelihood, by a search on a lattice of decreasing step.
 
         Args:
-            model: Along the recordings.
-            start: First states.
-            level: Intensities to start from.
+            model: Linear models along the recordings.
+            start: Distributions of the first states.
+            level: Intensities from which the search starts.
             factor: First step of the lattice.
         """
         while factor > LATTICE_TOLERANCE:
@@ -227,16 +227,16 @@ class IntensityEstimator:
     def gains(
         self, model: LinearTimeVaryingModel, start: InitialDistribution, level: Float[np.ndarray, " D"]
     ) -> Float[np.ndarray, " D"]:
-        """Log-likelihood that each torque gains over none, the others as they are [nat]."""
+        """Log-likelihood that each torque gains over the least intensity, with the others unchanged [nat]."""
         without = np.where(np.eye(self.torques, dtype=bool), self.smallest, level)
         rows = np.vstack([level, without])
-        # As many as on the lattice, so that nothing is compiled again.
+        # Filled up to the number of rows of the lattice, so that nothing is compiled again.
         fill = np.tile(level, (len(self._lattice()) - len(rows), 1))
         all_torques, *others = self.log_likelihoods(model, start, np.vstack([rows, fill]))
         return all_torques - np.array(others[: self.torques])
 
     def _process_noise(self, level: Float[np.ndarray, "*batch D"]) -> Float[np.ndarray, "*batch R m"]:
-        """Variance per sample that the process noise adds to every state."""
+        """Variance that the process noise adds to every state per sample."""
         torques = level[..., None, :] * self.variance_growth[:, None]
         return np.concatenate([np.zeros((*torques.shape[:-1], self.states)), torques], axis=-1)
 
@@ -248,7 +248,7 @@ class IntensityEstimator:
         return InitialDistribution(jnp.asarray(start.mean), jnp.asarray(variance))
 
     def _lattice(self) -> np.ndarray:
-        """Neighbours (L, D) in all directions; of many torques, one at a time."""
+        """Exponents (L, D) of neighbours on the lattice; for more than two torques, one axis at a time."""
         if self.torques > 2:
             return np.vstack([np.zeros(self.torques), np.eye(self.torques), -np.eye(self.torques)])
         return np.array(list(itertools.product((-1, 0, 1), repeat=self.torques)))
@@ -256,13 +256,13 @@ class IntensityEstimator:
 
 @dataclasses.dataclass(frozen=True)
 class UnknownTorque(Force):
-    """A torque from outside, held over a sample."""
+    """An external torque, held over a sample."""
 
     name: ClassVar[str] = "unknown_torque"
     title: ClassVar[str] = "unknown torque"
     equation: ClassVar[str] = "tau = torque"
 
-    # A placeholder where a mechanism is taken without its parameter values.
+    # The type is Any, since a mechanism without parameter values has a placeholder here.
     torque: Any = parameter(0.0, unit="N m", meaning="torque held over a sample")
 
     def force(self, position: Scalar, speed: Scalar, voltage: Scalar) -> Any:
@@ -272,10 +272,10 @@ class UnknownTorque(Force):
 
 @dataclasses.dataclass(frozen=True)
 class AugmentedStep:
-    """The augmented state `[x, d]` one sample later: `d` are unknown torques, which decay.
+    """Step of the augmented state `[x, d]` by one sample; `d` are unknown torques, which decay.
 
     Attributes:
-        structure: The mechanism without parameter values, its last effects the unknown torques.
+        structure: The mechanism without parameter values; its last effects are the unknown torques.
         solver: Integration rule.
         torques: Number of unknown torques.
     """
@@ -287,7 +287,7 @@ class AugmentedStep:
     def __call__(
         self, s: Float[Array, "m *batch"], v: Float[Array, "*samples"], constants: Any
     ) -> Float[Array, "m *batch"]:
-        """State one sample later under the voltage `v`; one state, or many side by side."""
+        """State one sample later under the voltage `v`; for one state, or for a batch of states."""
         c, decay = constants
         x, d = s[: -self.torques], s[-self.torques :]
         known = c.values.shape[0] - self.torques
@@ -306,7 +306,7 @@ def predicted_states(
     data: StackedRecordings,
     K: Float[Array, "R n C"],
 ) -> Float[Array, "R N n"]:
-    """States of a predictor with the gains `K`, which stays near the measured outputs."""
+    """States of a predictor with the gains `K`, which follows the measured outputs."""
 
     def one(x0: Any, K: Any, u: Any, y: Any, seen: Any, Ts: Any) -> jax.Array:
         return predictor_run(structure, solver, values, gates, x0, u, y, seen, K, Ts)[0]
@@ -323,7 +323,7 @@ def linearise_along(
     data: StackedRecordings,
     decay: Float[Array, " R"],
 ) -> LinearTimeVaryingModel:
-    """Linear models (R, ...), tangent to the augmented model along its states `S`."""
+    """Linearisations (R, ...) of the augmented model along its states `S`."""
     mechanism = step.structure.with_values(values)
 
     def one(S: Any, u: Any, y: Any, seen: Any, Ts: Any, decay: Any) -> LinearTimeVaryingModel:

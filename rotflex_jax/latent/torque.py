@@ -28,9 +28,9 @@ from rotflex_jax.runtime.xla import double_precision
 
 Progress = Callable[[str], None]
 
-# Linearisations along the latest smoothed states, at most.
+# Largest number of linearisations along the latest smoothed states.
 MAX_LINEARISATIONS = 4
-# A torque below this share of the motor's counts as none.
+# A torque below this share of the motor's torque counts as zero.
 NEGLIGIBLE_TORQUE_SHARE = 1e-6
 
 
@@ -41,32 +41,34 @@ def latent_torque(
     *,
     progress: Progress | None = None,
 ) -> LatentTorque:
-    """Estimate the torques that a model lacks, from what was measured.
+    """Estimate the torques that a model lacks, from recordings.
 
         x[k+1] = F(x[k], u[k], d[k]),   d[k+1] = exp(-Ts / T) d[k] + w[k],   y[k] = h(x[k]) + v[k]
 
-    Each port gets an unknown torque `d`, a random walk that decays over the length `T` of the longest
-    recording (an Ornstein-Uhlenbeck process). Its intensity is chosen by maximum likelihood; where the
-    model is right it tends to zero. Mean and standard deviation of `d` given all samples come from a
-    smoother along the motion; a nonlinear model is linearised again along the smoothed states until they
-    no longer change.
+    Each port has an unknown torque `d`, a random walk that decays with the length `T` of the longest
+    recording as time constant (an Ornstein-Uhlenbeck process). Its intensity is estimated by maximum
+    likelihood; if the model is right, it tends to zero. Mean and standard deviation of `d` given all samples
+    come from a Kalman smoother along the motion. A nonlinear model is linearised again along the smoothed
+    states until they no longer change.
 
-    The parameters of the model are held: fit it first. The part of the missing effect that fitted parameters
-    already explain (a damper takes the slope of a friction) is not in the torque; `given_back` adds it.
-    Not for effects that are not torques: a sensor error, a delay.
+    The parameters of the model are held, so fit it first. The torque does not contain the part of the missing
+    effect for which fitted parameters compensate (a damper, for example, compensates for the mean slope of a
+    friction); `given_back` adds it. Do not use it for effects that are no torques, such as a sensor error or
+    a delay.
 
     Args:
         model: Fitted model.
-        recordings: One or several.
-        ports: Where torques act; the smallest set that drives every coordinate if None (`hub` and `joint`).
+        recordings: One or several recordings.
+        ports: Ports at which torques act; if None, the smallest set that drives every coordinate (`hub` and
+            `joint`).
         progress: Called with a line of text now and then.
 
     Returns:
-        Torques with their standard deviations, positions and speeds of their ports.
+        Torques with their standard deviations, and positions and speeds of their ports.
 
     Raises:
-        InputError: No recording, a channel that the model lacks, ports that do not exist or whose
-            directions depend on each other.
+        InputError: If there is no recording, if a recording lacks a channel of the model, if ports do not
+            exist, or if their directions are linearly dependent.
 
     Source: B. Bell, SIAM J. Optim. 4, 1994 (the iterated smoother); T. Rogers and T. Friis, arXiv
     2109.10681, 2021 (unknown forces as states).
@@ -114,7 +116,7 @@ def latent_torque(
 
 
 def _checked_ports(m: Mechanism, ports: Sequence[str]) -> tuple[str, ...]:
-    """Ports that exist and have linearly independent directions."""
+    """Ports, checked to exist and to have linearly independent directions."""
     known, wanted = m.port_vectors, (ports,) if isinstance(ports, str) else checks.names(ports, "ports")
     for port in wanted:
         if port not in known:
@@ -130,7 +132,7 @@ def _checked_ports(m: Mechanism, ports: Sequence[str]) -> tuple[str, ...]:
 
 
 def _predicted_trajectory(model: Model, augmented: Mechanism, dataset: Dataset) -> np.ndarray:
-    """States (R, N, n) of a predictor, along which the model is linearised first."""
+    """States (R, N, n) of a predictor, along which the model is linearised at first."""
     m, first = model.mechanism, dataset.first_states
     x0 = np.tile(rest_state(m.structure, np.float64), (len(first), 1))
     x0[:, : first.shape[1]] = first
@@ -143,9 +145,9 @@ def _predicted_trajectory(model: Model, augmented: Mechanism, dataset: Dataset) 
 
 
 def _initial_distribution(S: np.ndarray, seen: np.ndarray) -> InitialDistribution:
-    """First states of the predictor, with the variances of the states over the recording."""
+    """Distribution of the first states: values of the predictor, variances of its states over a recording."""
     variance = np.array([np.var(x[s > 0], axis=0) for x, s in zip(S, seen, strict=True)])
-    # A state that hardly varies is not known exactly either.
+    # A state that hardly varies has a least variance, since it is not known exactly.
     return InitialDistribution(S[:, 0], np.maximum(variance, 1e-6 * variance.max(axis=1, keepdims=True)))
 
 

@@ -73,11 +73,11 @@ class Layout:
         size: Number of states.
         rotor: Index of the rotor's angle, if a gear has play.
         torque_ports: Ports at which nonlinear torques act, those with dry friction first.
-        port_matrix: Their vectors.
-        rotor_side: One for those on the motor's side of a gear with play, zero for the others.
-        contacts: How many of them have dry friction.
+        port_matrix: Vectors of the torque ports.
+        rotor_side: One for torque ports on the motor's side of a gear with play, zero for the others.
+        contacts: How many torque ports have dry friction.
         output_rows: Each output as a combination of positions and speeds.
-        output_states: Index of the state that an output shows as it is, None for the others.
+        output_states: Index of the state that an output reads directly; None for the other outputs.
     """
 
     n: int
@@ -119,7 +119,7 @@ class Layout:
 
 
 def _shown_state(structure: Mechanism, port: str, what: str) -> int | None:
-    """Index of the state that is the reading of a quantity at a port."""
+    """Index of the state that is the reading of a quantity at a port; None if no state is."""
     rows = own_states(structure)
     shown = (rows[i][0] for i, e in effects_of(structure, Memory) if e.at == port and e.shows == what)
     return next(shown, None)
@@ -172,11 +172,11 @@ class PlacedStamp(NamedTuple):
 
 
 def equations(mechanism: Mechanism, gates: Float[Array, " E"]) -> EquationsOfMotion:
-    """Equations of motion of the linear effects, each multiplied by its gate; a rotor's states stay at rest.
+    """Equations of motion of the linear effects, each times its gate; the states of a rotor stay at rest.
 
     Args:
         mechanism: Parameter values may be traced.
-        gates: One factor per effect; one where it is on, zero where it is off.
+        gates: One factor per effect: one if the effect is on, zero if it is off.
     """
     layout, each = Layout.of(mechanism.structure), jnp.unstack(gates)
     stamps = [PlacedStamp(e.stamp(), np.array(mechanism.vector(e)), each[i]) for i, e in stamped(mechanism)]
@@ -187,14 +187,14 @@ def equations(mechanism: Mechanism, gates: Float[Array, " E"]) -> EquationsOfMot
 def second_order_matrices(
     stamps: Iterable[tuple[Stamp, Sequence[Any]]], n: int, zero: Any = 0.0
 ) -> tuple[list[list[Any]], list[list[Any]], list[list[Any]], list[Any]]:
-    """`M`, `D`, `K` and the column of the voltage of the equations of motion, outside of JAX.
+    """`M`, `D`, `K` and the column of the voltage in the equations of motion, computed without JAX.
 
-    States that effects have of their own are left out.
+    The effects' own states are left out.
 
     Args:
-        stamps: Of linear effects, each with the vector of its port; in any kind of number.
+        stamps: Stamps of linear effects, each with the vector of its port; in any number type.
         n: Number of coordinates.
-        zero: Of that kind.
+        zero: The zero of that number type.
     """
     M, D, K = ([[zero] * n for _ in range(n)] for _ in range(3))
     drive = [zero] * n
@@ -234,7 +234,7 @@ def equations_from_stamps(
     right = jnp.concatenate([found[:, n:], jnp.asarray(vectors, dtype)], axis=1)
     solved = jnp.sum(Minv[:, :, None] * right[None], axis=1)
     D, K, B, answers = jnp.split(solved, (n, 2 * n, 2 * n + 1), axis=1)
-    # What states of their own do to the motion, and their own equations.
+    # Torques of the effects' own states on the motion, and the equations of these states.
     forces, below, inputs = [], [], []
     for k, (stamp, p, gate) in enumerate(own):
         m, vector = len(stamp.own), jnp.asarray(p, dtype)
@@ -255,7 +255,7 @@ def equations_from_stamps(
 
 
 def _inverse(M: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """Inverse of a mass matrix; written out where it is small, which compiles many times faster."""
+    """Inverse of a mass matrix; written out for small matrices, which compiles many times faster."""
     n = len(M)
     if n == 1:
         return 1 / M
@@ -272,9 +272,10 @@ def _scalar(value: Scalar, dtype: jnp.dtype) -> Array:
 class Constants(NamedTuple):
     """Constants of the exponential step, formed once per parameter set.
 
-    With `phi_k` the functions of an exponential integrator at `A h`, m linear states and p torque ports; each
-    array has a last axis of directions where sensitivities are carried along. What a step uses has a row of
-    zeros more for each memory in all responses of the states (`Exponential.prepare`).
+    Here `phi_k` are the functions of an exponential integrator at `A h`, for m linear states and p torque
+    ports. Where a run carries sensitivities along, each array has a last axis for the directions. In the
+    constants of a step, each response of the states has one more row of zeros for each memory
+    (`Exponential.prepare`).
 
     Attributes:
         values: Parameter values.
@@ -285,16 +286,16 @@ class Constants(NamedTuple):
         hold: `h phi_1 b_p`, the response to a constant port torque.
         ramp: `h phi_2 b_p`.
         rise: `h phi_3 b_p`.
-        half_E: `E` of a step of `h / 2`; None, as the next two, where the rule has no half steps.
-        half_input: `input` of such a step.
-        half_hold: `hold` of such a step.
+        half_E: `E` of a step of length `h / 2`; None, as the next two, if the rule has no half steps.
+        half_input: `input` of a step of length `h / 2`.
+        half_hold: `hold` of a step of length `h / 2`.
         stop: Speed that a unit torque at port j, held for one step, gives port i [rad/s per N m].
-        mobility: The same for a unit impulse.
-        push: Response of the linear states to a unit impulse that acts on positions.
-        gear: Constants of a gear with play (`gear.GearConstants`), None without one.
-        load: Rows of the transmitted torques (`step.LoadRows`), None where no friction depends on them.
-        tilt: `12 h (phi_2 - phi_1 / 2) B`, the response to a voltage without mean and of the first moment
-            one; None where no step uses it.
+        mobility: Displacement that a unit impulse on the positions at port j gives port i.
+        push: Response of the linear states to a unit impulse on the positions.
+        gear: Constants of a gear with play (`gear.GearConstants`); None without one.
+        load: Rows of the transmitted torques (`step.LoadRows`); None if no friction depends on them.
+        tilt: `12 h (phi_2 - phi_1 / 2) B`, the response to a voltage with zero mean and unit first moment
+            over the step; None if no step uses it.
     """
 
     values: Real[Array, "P *D"]
@@ -324,7 +325,7 @@ def constants(
     halves: bool = True,
     tilts: bool = False,
 ) -> Constants:
-    """Constants of a step of length `h` [s] for traced parameter values; on request those of half a step."""
+    """Constants of a step of length `h` [s] for traced values; with `halves` also those of half a step."""
     layout, eq = Layout.of(mechanism.structure), equations(mechanism.with_values(values), gates)
     return from_equations(eq, layout, values, gates, h, halves, tilts)
 
@@ -350,7 +351,7 @@ def from_equations(
         push = push.at[layout.rotor].set(eq.ports[layout.rotor + 1])
 
     def moved(coordinates: Array, states: Array, rotor: int) -> Array:
-        """Motion of the ports with the coordinates, and of those on the rotor's side with the rotor."""
+        """Motion of the ports with the coordinates; ports on the rotor's side also move with the rotor."""
         own, side = P @ coordinates, np.array(layout.rotor_side)
         return own + jnp.asarray(side, E.dtype)[:, None] * states[rotor][None] if side.any() else own
 
@@ -388,7 +389,7 @@ def voltage_within_samples(
 ) -> Float[Array, "N 2"]:
     """Mean of the motor's voltage over each sample, and its first moment about the middle [V].
 
-    First moments of a delay and a lag one after the other add.
+    The first moments of a delay and a lag in series add up.
     """
     v, moment = u, jnp.zeros_like(u)
     for i, effect in sorted(effects_of(mechanism, Actuation), key=lambda pair: pair[1].stage):
@@ -400,9 +401,9 @@ def voltage_within_samples(
 def motor_inputs(
     solver: Any, mechanism: Mechanism, gates: Float[Array, " E"], u: Float[Array, "N *c"], Ts: Period
 ) -> Float[Array, "N *h"]:
-    """What the steps of a solver take at each sample: the voltage of the motor, held, smooth or switched.
+    """Input of a solver's steps at each sample: the voltage of the motor, held, smooth or switched.
 
-    The signals of the mechanism follow where its effects take them.
+    If effects of the mechanism take signals, these follow as further columns.
     """
     voltage, signals = split_input(u)
     if getattr(solver, "between", "held") == "switched":
@@ -415,7 +416,7 @@ def motor_inputs(
 
 
 def split_input(u: Float[Array, "N *c"]) -> tuple[Float[Array, " N"], Float[Array, "N S"] | None]:
-    """The voltage, and the signals beside it; None where the input has none."""
+    """The voltage, and the signals beside it; None if the input has no signals."""
     return (u, None) if u.ndim == 1 else (u[:, 0], u[:, 1:])
 
 

@@ -1,13 +1,14 @@
 """One step with play in a gear whose teeth are elastic: flight, contact and separation within the step.
 
-In flight the equations are those of `gear`, with the rotor as one coordinate more. The teeth swing above the
-sampling frequency, so their torque is no force that a step samples. Against each other rotor and port are one
-oscillator, driven by what both would do without the teeth (a cubic over the step):
+In flight the equations are the same as in `gear`, with the rotor as one more coordinate. The teeth oscillate
+above the sampling frequency, so a step cannot sample their torque. The motion of the rotor relative to the
+port is an oscillator, driven by the relative motion without the teeth (a cubic over the step):
 
     depth'' + damping/mass depth' + stiffness/mass depth = r_flight''
 
-Its solution is known in closed form. So are the end of the contact, where the torque falls to zero, and the
-first three moments of the torque over the step, by which it acts on all states. Stable at any stiffness.
+Its solution is known in closed form. From it follow the end of the contact, where the torque falls to zero,
+and the first three moments of the torque over the step, through which the torque acts on all states. The step
+is stable at any stiffness.
 
 Source: K. L. Johnson, Contact Mechanics, 1985, section 11.5 (impact as half a period of an oscillator);
 F. Pfeiffer and C. Glocker, Multibody Dynamics with Unilateral Contacts, 1996, chapter 6.
@@ -25,8 +26,8 @@ from rotflex_jax.mechanism.gear import Advance, crossing_time, delayed
 from rotflex_jax.mechanism.mechanism import Mechanism
 from rotflex_jax.mechanism.small_matrices import matvec
 
-# Intervals in which the torque of the teeth is looked at for its first sign change, the first of them halved
-# this often.
+# Number of intervals in which the first sign change of the tooth torque is searched, and how often the first
+# of these intervals is halved.
 LOOKS, HALVINGS = 8, 3
 
 
@@ -39,15 +40,15 @@ class Cubic(NamedTuple):
     e: Float[Array, "*S"]
 
     def at(self, t: Float[Array, "*S"]) -> Float[Array, "*S"]:
-        """Value."""
+        """Value at `t`."""
         return self.a + t * (self.b + t * (self.d + t * self.e))
 
     def slope(self, t: Float[Array, "*S"]) -> Float[Array, "*S"]:
-        """Derivative."""
+        """Derivative at `t`."""
         return self.b + t * (2 * self.d + 3 * t * self.e)
 
     def integral(self, t: Float[Array, "*S"]) -> Float[Array, "*S"]:
-        """Integral from 0."""
+        """Integral from 0 to `t`."""
         return t * (self.a + t * (self.b / 2 + t * (self.d / 3 + t * self.e / 4)))
 
 
@@ -64,13 +65,13 @@ class Swing(NamedTuple):
 
 
 def swing(stiff: Float[Array, "*S"], loss: Float[Array, "*S"], t: Float[Array, "*S"]) -> Swing:
-    """Of `y'' + loss y' + stiff y = 0` after the time `t`."""
+    """Free motion of `y'' + loss y' + stiff y = 0` after the time `t`."""
     square = stiff - loss * loss / 4
     near = jnp.abs(square) * t * t < 1e-4
     quick, over = ~near & (square > 0), ~near & (square < 0)
     w = jnp.sqrt(jnp.where(quick, square, 1.0))
     v = jnp.sqrt(jnp.where(over, -square, 1.0))
-    # Where overdamped the slower of two exponents, without a difference of large numbers, else the only one.
+    # If overdamped, the slower of two exponents, without a difference of large numbers; else the only one.
     fade = jnp.exp(-jnp.where(over, stiff / (loss / 2 + v), loss / 2) * t)
     fast = jnp.exp(-jnp.where(over, loss / 2 + v, 0.0) * t)
     z = jnp.where(near, square * t * t, 0.0)
@@ -81,15 +82,15 @@ def swing(stiff: Float[Array, "*S"], loss: Float[Array, "*S"], t: Float[Array, "
 
 
 class Oscillator(NamedTuple):
-    """Depth of teeth in contact: what the flight asks for, linear in time, and a free motion about it.
+    """Depth of teeth in contact: an equilibrium depth that is linear in time, and a free motion about it.
 
     Attributes:
         stiff: Stiffness over mass, in units of the step.
         loss: Damping over mass, in units of the step.
         y: Free motion at the beginning.
-        dy: Its rate.
-        rests: The rest of the depth at the beginning.
-        grows: Its rate.
+        dy: Rate of the free motion at the beginning.
+        rests: Equilibrium depth at the beginning.
+        grows: Rate of the equilibrium depth.
     """
 
     stiff: Float[Array, "*S"]
@@ -102,7 +103,7 @@ class Oscillator(NamedTuple):
     def moved(
         self, s: Swing, y: Float[Array, "*S"], dy: Float[Array, "*S"]
     ) -> tuple[Float[Array, "*S"], Float[Array, "*S"]]:
-        """Free motion and its rate after the time of a swing."""
+        """Free motion and its rate after the time of the swing `s`."""
         return (
             y * s.cosine + (dy + self.loss / 2 * y) * s.sine,
             dy * s.cosine - (self.stiff * y + self.loss / 2 * dy) * s.sine,
@@ -111,7 +112,7 @@ class Oscillator(NamedTuple):
     def torque(
         self, t: Float[Array, "*S"], y: Float[Array, "*S"], dy: Float[Array, "*S"]
     ) -> tuple[Float[Array, "*S"], Float[Array, "*S"]]:
-        """Torque over mass, and its rate, at a time with this free motion."""
+        """Torque over mass, and its rate, at time `t`, where the free motion is `y` with the rate `dy`."""
         bend = -self.stiff * y - self.loss * dy
         value = self.stiff * (self.rests + self.grows * t) + self.loss * self.grows - bend
         return value, self.stiff * (self.grows + dy) + self.loss * bend
@@ -121,10 +122,10 @@ class ToothContact(NamedTuple):
     """Teeth in contact for a part of a step.
 
     Attributes:
-        start: Where in the step it begins.
+        start: Fraction of the step at which the contact begins.
         impulse: Integral of the torque over the step, in units of the step.
-        moments: Its first three moments.
-        lasts: Whether they are in contact at the end.
+        moments: First three moments of the torque over the step.
+        lasts: Whether the teeth are in contact at the end of the step.
     """
 
     start: Float[Array, "*S"]
@@ -146,12 +147,12 @@ def contact(
     Args:
         flight: Depth without the torque of the teeth.
         touching: Whether there is a contact; without one the moments are zero.
-        start: Where it begins; until then the depth is that of the flight.
+        start: Fraction of the step at which the contact begins; until then the depth is `flight`.
         stiff: Stiffness over mass, in units of the step.
         loss: Damping over mass, in units of the step.
         mass: Effective inertia over the square of the step [N m per unit of acceleration].
     """
-    # What the depth would be in equilibrium with the acceleration of the flight, linear in time.
+    # Depth in equilibrium with the acceleration of the flight; linear in time.
     grows = 6 * flight.e / stiff
     rests = (2 * flight.d - loss * grows) / stiff
     y0 = flight.at(start) - rests - grows * start
@@ -161,7 +162,7 @@ def contact(
     oscillator = Oscillator(stiff, loss, y0, dy0, rests + grows * start, grows)
     length = jax.lax.stop_gradient(_until_zero(oscillator, span))
     ends = length < jax.lax.stop_gradient(span)
-    # At its end the torque is zero: the moments do not depend on where that is, to first order.
+    # The torque is zero at the end of the contact: to first order the moments do not depend on that time.
     length = jnp.where(ends, length, span)
     t = start + length
     y, dy = oscillator.moved(swing(stiff, loss, length), y0, dy0)
@@ -178,13 +179,14 @@ def contact(
 def _until_zero(o: Oscillator, span: Array) -> Array:
     """Time until the torque first falls to zero, or `span`.
 
-    An oscillator whose torque is above zero for a whole period stays so, as it decays. Exponentials are
-    evaluated twice only: from one evaluation to the next the motion is a product, between them a cubic.
+    If the torque is positive for a whole period, it stays positive, because the oscillation decays.
+    Exponentials are evaluated only twice: a product advances the motion from one point to the next, and a
+    cubic interpolates between them.
     """
     square = o.stiff - o.loss * o.loss / 4
     period = 2 * np.pi / jnp.sqrt(jnp.where(square > 0, square, 1.0))
     each = jnp.where((square > 0) & (period < span), period, span) / LOOKS
-    # Closer at the beginning, where a strongly damped torque changes fast.
+    # Shorter intervals at the beginning, where a strongly damped torque changes fast.
     step = each / 2**HALVINGS
     move = swing(o.stiff, o.loss, step)
     here = o.torque(jnp.zeros_like(span), o.y, o.dy)
@@ -219,7 +221,7 @@ def _until_zero(o: Oscillator, span: Array) -> Array:
 
 
 def _downwards(share: Array, value: Array, slope: Array, found: Array) -> Array:
-    """One Newton step to where a falling function is zero, within 0 and 1."""
+    """One Newton step towards the zero of a falling function, limited to the range 0 to 1."""
     falls = found & (slope < 0)
     share = share - jnp.where(falls, value, 0.0) / jnp.where(falls, slope, 1.0)
     return jnp.where(share < 0, 0.0, jnp.where(share > 1, 1.0, share))
@@ -254,7 +256,7 @@ def elastic_step(
     end = in_flight + push(first)
     found = first
     if layout.contacts:
-        # A port that friction holds does not give way: the teeth meet a larger inertia.
+        # A port that friction holds does not yield: the teeth meet a larger effective inertia.
         linear = push(first)
         response = advance(x, a.flight, linear) - in_flight - linear
         pushed = linear[k + 1]
@@ -264,7 +266,7 @@ def elastic_step(
         strong = jnp.abs(first.impulse) > 0
         scale = jnp.where(strong, found.impulse, 0.0) / jnp.where(strong, first.impulse, 1.0)
         end = in_flight + push(found) + scale[None] * delayed(start, response, layout)
-    # A second contact within the step begins with the next one, without the depth it has not yet reached.
+    # A second contact within the step is put off to the beginning of the next step, at zero depth.
     angle, side1 = end[k], jnp.where(end[k] > 0, 1.0, -1.0)
     again = (jnp.abs(angle) > gap) & (side1 * end[k + 1] > 0) & ~(found.lasts & (side1 == side))
     return end.at[k].set(jnp.where(again, side1 * gap, angle))

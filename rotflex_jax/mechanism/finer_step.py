@@ -1,6 +1,6 @@
 """The same integration in shorter steps, for models whose steps are not exact.
 
-Search and fit ask by it how far estimates depend on the step.
+Search and fit use it to find how far estimates depend on the step.
 """
 
 import dataclasses
@@ -10,20 +10,21 @@ from rotflex_jax.effects.base import Effect
 from rotflex_jax.mechanism.simulate import Solver
 from rotflex_jax.mechanism.step import Exponential
 
-# Substeps in the place of one. Sixteen moved no estimate further by a third of its standard deviation.
+# Number of substeps in place of one. With sixteen no estimate moved further by a third of its standard
+# deviation.
 SUBSTEP_FACTOR = 4
 
 
 def with_finer_steps(solver: Solver, effects: Iterable[Effect]) -> Exponential | None:
-    """The solver with steps `SUBSTEP_FACTOR` times as short; None where that has no use or is not possible.
+    """The solver with steps shorter by `SUBSTEP_FACTOR`; None if that is not possible or has no effect.
 
-    A linear motion is integrated exactly, and effects on voltages and readings need no integration.
-    `SmoothRK4` has an error of its own, its smoothed friction. A voltage that is switched within a sample
-    needs one step per sample.
+    Linear motion is integrated exactly, and effects on voltages and readings need no integration.
+    `SmoothRK4` has another error, its smoothed friction. A voltage that is switched within a sample needs one
+    step per sample.
 
     Args:
-        solver: Of the model.
-        effects: Of its mechanism.
+        solver: Solver of the model.
+        effects: Effects of its mechanism.
     """
     if not isinstance(solver, Exponential) or solver.between == "switched":
         return None

@@ -1,4 +1,4 @@
-"""Dry friction over one step: sliding, sticking or breakaway, with the stop inside the step resolved.
+"""Dry friction over one step: sliding, sticking or breakaway, including a stop within the step.
 
 Each contact acts as a torque `f` that is constant over the step, `|f| <= level`. If the port keeps its
 direction, `f` is the full level. If it stops at a fraction `t` of the step, either the remaining drive is
@@ -42,7 +42,7 @@ def at_rest(
     up: Float[Array, "*S"],
     down: Float[Array, "*S"],
 ) -> Bool[Array, "*S"]:
-    """Whether a speed is zero to rounding; arguments as in `independent_contacts`."""
+    """Whether a speed is zero up to rounding errors; arguments as in `independent_contacts`."""
     return jnp.abs(v0) <= 64 * jnp.finfo(v0.dtype).eps * (jnp.abs(free) + stop * (up + down))
 
 
@@ -74,7 +74,7 @@ def independent_contacts(
     rests = ~keeps & (jnp.abs(drive) <= turned)
     reverses = -(t * sign * level + (1 - t) * jnp.sign(drive) * turned)
     f = jnp.where(keeps, -sign * level, jnp.where(rests, -free / stop, reverses))
-    # In units of the mean level, which a constant torque does not change.
+    # In units of the mean level: a constant torque shifts both levels but does not change their mean.
     band = (up + down) / 2
     beyond = jnp.maximum(0.0, (jnp.abs(drive) - turned) / jnp.where(band == 0, 1.0, band))
     holds = jnp.where((band == 0) | keeps, 0.0, jnp.maximum(0.0, 1.0 - beyond))
@@ -97,7 +97,7 @@ def all_slide(
 ) -> Bool[Array, "*S"]:
     """Whether all contacts keep their direction, each by itself and together.
 
-    `coupled_contacts` gives `sliding_torques` then. Arguments as there.
+    If so, `coupled_contacts` gives the torques of `sliding_torques`. Arguments as in `coupled_contacts`.
     """
     k, torque = len(v0), sliding_torques(v0, up, down)
     keeps = []
@@ -128,8 +128,8 @@ def solve_masked(
     """Solve `matrix[m, :] f = rhs[m]` for the masked rows m, with `f = other` in the others.
 
     Elimination is unrolled: there are few contacts, and a library call would break the fusion of the scan. A
-    ridge of 1e-10 regularises contacts that share one direction of motion. The matrix has no axes beyond the
-    second, or those of the other arguments.
+    ridge of 1e-10 regularises contacts that share one direction of motion. Beyond its first two axes the
+    matrix has no further axes, or the further axes of the other arguments.
     """
     k = matrix.shape[0]
     if k == 1:
@@ -161,20 +161,21 @@ def coupled_contacts(
 ) -> Contact:
     """Contacts that are coupled through the mechanism.
 
-    Contacts at rest are first assumed to stick and are eliminated; the others respond with the remaining
-    mobility, and those that exceed their level slide in the next pass. One pass more than there are contacts
-    solves any case of two; of three that break away together, one in a hundred lets a contact go for that
-    step which the others would hold again. Two passes solve all but cases in which several contacts stop or
-    break away in one step.
+    Contacts at rest are first assumed to stick, and are eliminated. The other contacts respond with the
+    mobility that remains. Sticking contacts whose torque exceeds their level slide in the next pass.
+
+    For k contacts, k + 1 passes solve any case of two contacts. Where three contacts break away together,
+    about one case in a hundred lets a contact slide during that step although the others would hold it again.
+    Two passes solve all cases except those in which several contacts stop or break away in one step.
 
     Args:
         v0: Port speeds at the start [rad/s].
         free: Port speeds at the end without friction [rad/s].
-        stop: Speed that a unit torque at one contact gives another in one step [rad/s per N m]; no axes
-            beyond the second, or those of the other arguments.
+        stop: Speed that a unit torque at one contact gives another in one step [rad/s per N m]; beyond its
+            first two axes it has no further axes, or the further axes of the other arguments.
         up: Levels against positive motion [N m].
         down: Levels against negative motion [N m].
-        passes: One more than contacts if None.
+        passes: Number of passes; the number of contacts plus one if None.
     """
     k = v0.shape[0]
     if k == 1:
@@ -182,12 +183,12 @@ def coupled_contacts(
     return _coupled(v0, free, stop, up, down, k + 1 if passes is None else passes)
 
 
-# Traced once for all places of a step, and of other steps with arrays like these.
+# Traced once for all calls, in this step or in others, whose arrays have equal shapes.
 @functools.partial(jax.jit, static_argnames="passes")
 def _coupled(v0: Array, free: Array, stop: Array, up: Array, down: Array, passes: int) -> Contact:
     """Several contacts; arguments as in `coupled_contacts`."""
     k = v0.shape[0]
-    # Contact by contact: a matrix put together of its rows is a branch in the compiled loop over the entries.
+    # Contact by contact: rows stacked to a matrix would put a branch into the compiled loop over the entries.
     every, (start, end, forward, back) = range(k), map(jnp.unstack, (v0, free, up, down))
     mobility = [[expand_axes(stop[i, j], start[0]) for j in every] for i in every]
     slack = 1 + 1e3 * jnp.finfo(start[0].dtype).eps
@@ -200,7 +201,7 @@ def _coupled(v0: Array, free: Array, stop: Array, up: Array, down: Array, passes
     for last in (*[False] * (passes - 1), True):
         rows, needed = [[*mobility[i], end[i]] for i in every], []
         for i in every:  # Gauss-Jordan
-            # Three contacts on two coordinates: one that is at rest by the others alone carries no torque.
+            # With three contacts on two coordinates, one that the other two hold at rest carries no torque.
             needed.append(held[i] & (rows[i][i] > 1e-5 * mobility[i][i]))
             scale = 1 / jnp.where(needed[i], rows[i][i], 1.0)
             pivot = [entry * scale for entry in rows[i]]

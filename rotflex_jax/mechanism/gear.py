@@ -1,9 +1,9 @@
 """One step with play in the gear: rotor and port in contact, or the rotor in flight between the stops.
 
-In contact the equations are those without play, whose exact step is used. In flight the equations have one
-coordinate more, and the torque of the teeth keeps the rotor within its stops. A step in which the teeth make
-contact or separate represents that torque by its first three moments over the step: an impulse at the instant
-of impact and a constant torque after it, or a torque that falls linearly to zero.
+In contact the equations are the same as without play, and their exact step is used. In flight the equations
+have one more coordinate, and the torque of the teeth keeps the rotor within its stops. A step in which the
+teeth make contact or separate represents that torque by its first three moments over the step: an impulse at
+the instant of impact and a constant torque after it, or a torque that falls linearly to zero.
 
 Source: F. Pfeiffer and C. Glocker, Multibody Dynamics with Unilateral Contacts, 1996, chapter 6, for the
 states of a contact and the conditions that end them.
@@ -47,7 +47,7 @@ class GearConstants(NamedTuple):
         line: Response of the m linear states to the teeth's torque on the port: one column for a constant
             torque, one for a torque that grows from 0 to 1 over the step.
         moments: The same for a torque with the first, second or third moment alone.
-        correction: Constant and growing torque that cancel an error of the rotor's angle and speed.
+        correction: Constant and growing tooth torque that cancel an error of the rotor's angle and speed.
         mass: Effective inertia of an impact of the teeth [kg m^2].
         teeth: Stiffness and damping of elastic teeth, None where they are rigid.
     """
@@ -62,7 +62,7 @@ class GearConstants(NamedTuple):
 
 
 def gear_steps(structure: Mechanism) -> int:
-    """Steps into which the gear cuts a step."""
+    """Number of shorter steps into which a gear divides each step; one without a gear."""
     return max((gear.steps for _, gear in effects_of(structure, Gear)), default=1)
 
 
@@ -97,7 +97,7 @@ def gear_constants(
         # The rotor of a gear that is switched off stays at rest, and its teeth never touch.
         flight = jax.tree.map(lambda apart, one: jnp.where(gates[i] > 0, apart, one), flight, tight)
         teeth = (jnp.asarray(teeth[0], h.dtype), jnp.asarray(teeth[1], h.dtype))
-    # Responses of the whole state: memories do not respond at once.
+    # Responses of the whole state; zero for memories, which do not respond at once.
     padded = lambda m: jnp.pad(m, ((0, layout.size - len(m)), (0, 0)))  # noqa: E731
     return GearConstants(
         gap=gates[i] * gear.stops(),
@@ -113,8 +113,8 @@ def gear_constants(
 def _equations(known: Mechanism, gear: Gear, gates: Array, layout: Layout) -> tuple[EquationsOfMotion, Array]:
     """Equations of motion with the rotor in flight, and the column of the teeth's torque on the port.
 
-    The rotor's angle relative to the port is an additional coordinate, and the motor acts at port plus rotor,
-    as all that is put at `rotor` does.
+    The rotor's angle relative to the port is an additional coordinate. The motor, and every effect at the
+    port `rotor`, acts at the sum of port and rotor.
     """
     n, share = layout.n, gear.rotor()
     acting = []
@@ -146,11 +146,11 @@ def geared_step(
     """State at the end of a step with rigid teeth.
 
     Args:
-        mechanism: With (traced) parameter values.
-        x: State, or states side by side.
+        mechanism: Mechanism with (traced) parameter values.
+        x: State, or several states side by side.
         c: Constants with `gear`.
-        advance: State and constants to the state after the step; its last argument, zero for memories, is
-            added to the linear states at the end of the step.
+        advance: Function of state and constants that returns the state after the step. Its last argument,
+            zero for memories, is added to the linear states at the end of the step.
     """
     layout, a = Layout.of(mechanism.structure), c.gear
     k, gap = layout.rotor, a.gap
@@ -162,7 +162,7 @@ def geared_step(
     stays, separation = _separation(r, in_flight[k], in_flight[k + 1], touching, a)
     beyond = jnp.abs(in_flight[k]) > gap
     stop = jnp.where(in_flight[k] > 0, gap, -gap)
-    # Separated and driven back to the same stop within the step: as if it had stayed in contact.
+    # Separated and driven back to the same stop within the step: treated as if it had stayed in contact.
     stays = stays | (touching & ~separation.separates & beyond & (stop * r > 0)) | (gap <= 0)
     impacts = beyond & ~separation.separates
 
@@ -177,14 +177,14 @@ def geared_step(
         response = advance(x, a.flight, push) - in_flight - push
         end = in_flight + push + jnp.where(impacts[None], delayed(impact.t, response, layout), response)
         rests = impacts & impact.rests
-        # Friction and other torques have responded to the torque of the teeth.
+        # The response of friction and other torques to the teeth leaves an error of angle and speed.
         error = jnp.stack([end[k] - stop, end[k + 1]])
         end = end + matvec(a.line, jnp.where(rests[None], matvec(a.correction, error), 0.0))
         angle = jnp.where(rests, stop, jnp.where(end[k] > gap, gap, jnp.where(end[k] < -gap, -gap, end[k])))
         return with_rows(end, {k: angle, k + 1: jnp.where(rests, 0.0, end[k + 1])})
 
-    # Most steps are all in contact or all in flight. Each result is selected where it holds: a branch is
-    # computed if any of the states side by side needs it, and stands in the program once.
+    # In most steps all states are in contact, or all are in flight. Each result is selected where it holds. A
+    # branch is computed if any of the states side by side needs it, and is in the program once.
     changes = ~stays & (impacts | separation.separates)
     apart = shortcut(lambda: (~changes, lambda: in_flight), with_change_of_contact)
     return jnp.where(stays[None], shortcut(lambda: (~stays, lambda: apart), in_contact), apart)
@@ -194,8 +194,8 @@ class Separation(NamedTuple):
     """Teeth in contact at the start that separate within the step.
 
     Attributes:
-        separates: Whether they do.
-        moments: Moments of their torque over the step.
+        separates: Whether the teeth separate.
+        moments: Moments of the tooth torque over the step.
     """
 
     separates: Bool[Array, "*S"]
@@ -205,13 +205,13 @@ class Separation(NamedTuple):
 def _separation(
     r: Array, angle: Array, speed: Array, touching: Array, a: GearConstants
 ) -> tuple[Array, Separation]:
-    """Whether teeth stay in contact; otherwise how they separate.
+    """Whether teeth stay in contact; if not, how they separate.
 
     Args:
         r: Angle of the rotor at the start, at a stop where the teeth are in contact.
-        angle: At the end of a step in which they separate at once.
-        speed: The same.
-        touching: Whether they are in contact.
+        angle: Angle of the rotor at the end of the step if the teeth separate at once.
+        speed: Speed of the rotor relative to the port at that end.
+        touching: Whether the teeth are in contact at the start.
         a: Constants.
     """
     side = jnp.where(r > 0, 1.0, -1.0)
@@ -226,7 +226,7 @@ def _separation(
 
 
 def delayed(t: Float[Array, "*S"], response: Float[Array, "n *S"], layout: Layout) -> Float[Array, "n *S"]:
-    """Response of friction and other torques to an impact at the fraction `t` of a step, from that at 0."""
+    """Response of friction and other torques to an impact at fraction `t` of a step, from `response` at 0."""
     positions = {*range(layout.n), layout.rotor}
     return response * jnp.stack([(1 - t) ** 2 if i in positions else 1 - t for i in range(len(response))])
 
@@ -236,8 +236,8 @@ class Impact(NamedTuple):
 
     Attributes:
         t: Fraction of the step until the impact.
-        rests: Whether they stay in contact.
-        moments: Moments of their torque over the step.
+        rests: Whether the teeth stay in contact.
+        moments: Moments of the tooth torque over the step.
     """
 
     t: Float[Array, "*S"]
@@ -258,11 +258,11 @@ def _impact(
 
     Args:
         r: Angle of the rotor at the start.
-        s: Its speed against the port.
-        angle: At the end of the step without the stop.
-        speed: The same.
-        stop: The stop that it passes.
-        impacts: Where it does; elsewhere the result is any finite number.
+        s: Speed of the rotor relative to the port at the start.
+        angle: Angle of the rotor at the end of the step without the stop.
+        speed: Speed of the rotor relative to the port at that end.
+        stop: The stop that the rotor passes.
+        impacts: Where the rotor passes it; elsewhere the result is any finite number.
         c: Constants.
     """
     # The cubic through both ends, in units of the step: r + b t + d t^2 + e t^3.

@@ -1,17 +1,17 @@
-"""Sensitivities along laws that are inactive: what they would add to a step, and how the run responds.
+"""Sensitivities to the laws of inactive effects: what a law would add to a step, and how the run responds.
 
 A torque, a friction level, a voltage or a reading that an inactive effect would add changes a step by
 
     b[k] = sum over j of G[k, j] s[k, j],
 
-where `s[k, j]` is the value of its law at the j-th place of the step where laws are evaluated, and `G` is how
-the state after the step responds to a little more there. `G` belongs to the active model and is formed once
-for all laws; each law is evaluated along the run for its own directions alone, without a step around it; and
-one recursion carries all directions side by side,
+where `s[k, j]` is the value of the law at the j-th evaluation of laws within the step, and `G` is the
+derivative of the state after the step with respect to a value added there. `G` belongs to the active model
+and is formed once for all laws. Each law is evaluated along the run for its own directions alone, without a
+step around it. One recursion carries all directions side by side,
 
     dx[k+1] = A[k] dx[k] + b[k],   dy[k] = H[k] dx[k].
 
-Effects that enter the matrices of the step or have linear states are not of this form; `sensitivities` has
+Effects that enter the matrices of the step or have linear states are not of this form; `sensitivities` treats
 them.
 """
 
@@ -56,7 +56,7 @@ from rotflex_jax.mechanism.step import Exponential, exponential_euler, within
 
 
 class _Evaluations:
-    """Where laws are evaluated while one step is traced, in order, and what is added at each place."""
+    """The evaluations of laws while one step is traced, in order, and the value added at each of them."""
 
     def __init__(self, added: Float[Array, "L *S"] | None = None) -> None:
         self.added, self.motion = added, []
@@ -85,7 +85,7 @@ def _recorded(evaluations: _Evaluations) -> Iterator[None]:
 
 @dataclasses.dataclass(frozen=True)
 class AddedForce(Force):
-    """A torque that is given, at a port; it records where a step evaluates it."""
+    """A given torque at a port, which records where a step evaluates it."""
 
     name: ClassVar[str] = "added_force"
 
@@ -96,7 +96,7 @@ class AddedForce(Force):
 
 @dataclasses.dataclass(frozen=True)
 class AddedFriction(DryFriction):
-    """A friction level that is given, at a port; it records where a step evaluates it."""
+    """A given friction level at a port, which records where a step evaluates it."""
 
     name: ClassVar[str] = "added_friction"
 
@@ -109,15 +109,15 @@ class AddedFriction(DryFriction):
 FRICTION_EVALUATIONS = 6
 
 Extended = tuple[Mechanism, Solver, tuple[Effect, ...]]
-"""What is active, the integration rule, and the effects beside it that record evaluations."""
+"""The active structure, the integration rule, and the added effects that record evaluations."""
 
 
 class PortResponses(NamedTuple):
-    """Where a step evaluates laws at some ports, and how it responds to what is added there.
+    """Motion at which a step evaluates laws at some ports, and its response to values that are added there.
 
     Attributes:
         motion: Position [rad] and speed [rad/s] of the port at each of the J evaluations.
-        response: Change of the state after the step per unit that is added there.
+        response: Change of the state after the step per unit that is added at an evaluation.
     """
 
     motion: Float[Array, "*batch N p J 2"]
@@ -130,12 +130,12 @@ class RunResponses(NamedTuple):
     Attributes:
         run: States and the Jacobians of the steps.
         ideal: Readings of ideal sensors.
-        voltage: What drives each step [V], each substep of it where it changes within the sample; then the
-            signals that drive effects of the model.
-        to_voltage: Change of the state after a step per unit of each of these.
-        to_reading: The same per unit that a sensor reads more.
+        voltage: Input of each step: the voltage [V], as in `Exponential.advance`, then the signals that drive
+            effects of the model.
+        to_voltage: Change of the state after a step per unit of each of these inputs.
+        to_reading: Change of the state after a step per unit that is added to the reading of a sensor.
         readings: Change of the readings per unit of each state.
-        torques: Evaluations of torques at the ports; None where no port is asked for.
+        torques: Evaluations of torques at the ports; None if no port is given.
     """
 
     run: LinearisedRun
@@ -148,11 +148,11 @@ class RunResponses(NamedTuple):
 
 
 def adds_to_step(effect: Effect, structure: Mechanism, solver: Solver) -> bool:
-    """Whether the law of an inactive effect is of the form above, beside what is active.
+    """Whether the law of an inactive effect changes a step of this model as `sum over j of G[k, j] s[k, j]`.
 
     Args:
-        effect: The inactive one.
-        structure: What is active.
+        effect: The inactive effect.
+        structure: The active model.
         solver: Integration rule.
     """
     if isinstance(effect, Actuation):
@@ -171,7 +171,7 @@ def adds_to_step(effect: Effect, structure: Mechanism, solver: Solver) -> bool:
 
 
 def _has_load(structure: Mechanism) -> bool:
-    """Whether friction depends on the torque through a port, for which a step evaluates torques once more."""
+    """Whether friction depends on a transmitted torque, for which a step evaluates torques once more."""
     return any(e.loaded for _, e in effects_of(structure, DryFriction))
 
 
@@ -182,13 +182,13 @@ def run_responses(
     parameters: RunParameters,
     samples: RecordingSamples,
 ) -> RunResponses:
-    """A predictor run, with what the laws of inactive effects need to know of it.
+    """A predictor run, with the responses that the laws of inactive effects need.
 
     Args:
-        structure: What is active; static.
+        structure: The active model; static.
         solver: Integration rule; static.
-        ports: Where torques may be added; static.
-        parameters: Of this structure.
+        ports: Ports where torques may be added; static.
+        parameters: Parameters of this structure.
         samples: The recording.
     """
     mechanism, v, c = prepared_run(
@@ -226,9 +226,9 @@ def friction_responses(
 ) -> PortResponses:
     """How a run through states X responds to friction levels at some ports; arguments as in `run_responses`.
 
-    Evaluations against positive and against negative motion alternate.
+    Levels against positive and against negative motion alternate in the evaluations.
     """
-    # One contact beside those that are active: others without a level change nothing but the effort.
+    # One contact is added at a time: further ones without a level would only add to the cost.
     at_ports: list[PortResponses] = []
     for p in ports:
         extended = structure, solver, (AddedFriction(p),)
@@ -236,7 +236,7 @@ def friction_responses(
         found = _responses(extended, parameters, samples, X, laws_alone=True, count=count)
         at_ports.append(_by_port(*found, 2, 1))
     motion, response = jax.tree.map(lambda *each: jnp.concatenate(each, axis=1), *at_ports)
-    # A step without torques has fewer evaluations; filled up, all structures share the program of laws.
+    # A step without torques has fewer evaluations; filled up, all structures share one compiled program.
     more = max(FRICTION_EVALUATIONS - motion.shape[2], 0)
     motion = jnp.concatenate([motion, *[motion[:, :, :2]] * (more // 2)], axis=2)
     return PortResponses(motion, jnp.pad(response, ((0, 0), (0, 0), (0, more), (0, 0))))
@@ -245,7 +245,7 @@ def friction_responses(
 def _by_port(
     motion: Float[Array, "N L 2"], responses: Float[Array, "N L n"], kinds: int, ports: int
 ) -> PortResponses:
-    """Evaluations port by port: a step makes those of one kind in the order of the ports."""
+    """Evaluations sorted by port; a step makes the evaluations of one kind in the order of the ports."""
 
     def sorted_(a: Array) -> Array:
         N, L, width = a.shape
@@ -265,16 +265,16 @@ def _responses(
 ) -> tuple[Float[Array, "N L 2"], Float[Array, "N _ n"]]:
     """Motion at the L evaluations of added effects, and how the state after a step responds to changes.
 
-    These are changes of the state before it, of the voltage, of what is measured and of what the added
-    effects give, in this order, or of the last alone.
+    These are changes of the state before the step, of the voltage, of the measured outputs and of the values
+    of the added effects, in this order, or of the values of the added effects alone.
 
     Args:
-        extended: The step.
-        parameters: Of its structure without the added effects.
+        extended: Structure, integration rule and added effects of the step.
+        parameters: Parameters of the structure without the added effects.
         samples: The recording.
         X: States.
-        laws_alone: Whether only changes of what added effects give are asked for.
-        count: Number of evaluations L, where it is known.
+        laws_alone: Whether only changes of the values of added effects are wanted.
+        count: Number of evaluations L, if it is known.
     """
     structure, solver, added_effects = extended
     structure = dataclasses.replace(structure, effects=(*structure.effects, *added_effects)).structure
@@ -318,11 +318,11 @@ def _responses(
 
 
 class InactiveLaws(NamedTuple):
-    """Numbers of the laws of some inactive effects, for each effect those of its own S shapes.
+    """Parameter values of some inactive effects, each of which is tried with S shapes of its law.
 
     Attributes:
         values: Parameter values (S, P) of each effect.
-        along: D directions (S, D, P) in them; not used where an effect is switched on as a whole.
+        along: D directions (S, D, P) in these values; not used for an effect that is switched on as a whole.
     """
 
     values: tuple[Float[Array, "_ _"], ...]
@@ -340,12 +340,12 @@ def law_sensitivities(
     """Derivatives of the predicted outputs along laws at ports: torques, memories or friction levels.
 
     Args:
-        effects: All of one kind, without values; static.
-        ports: Those of the evaluations; static.
-        laws: Their numbers.
+        effects: Effects of one kind, without values; static.
+        ports: Ports of the evaluations; static.
+        laws: Parameter values of the effects.
         samples: The recording.
         responses: From `run_responses`.
-        at_ports: Its torques; of friction what `friction_responses` gives.
+        at_ports: Its `torques`; for dry friction the result of `friction_responses`.
     """
     v = responses.voltage[:, 0]
     places = [ports.index(e.at) for e in effects]
@@ -368,7 +368,7 @@ def law_sensitivities(
 
 
 def _basis(e: Effect) -> int:
-    """How many directions make up all of one shape: one per amplitude, or one where it is switched on."""
+    """Number of directions that span those of one shape: one per amplitude, or one if it is switched on."""
     return max(len(e.amplitudes), 1)
 
 
@@ -390,7 +390,7 @@ def _law_changes(
     values: Float[Array, "S P"],
     z: Float[Array, "J N S"] | None,
 ) -> Float[Array, "N J KS"]:
-    """What a law changes at each evaluation along its amplitudes, or as a whole where it is switched on."""
+    """Change by a law at each evaluation: along its amplitudes, or its whole value if it is switched on."""
 
     def at(j: int, values: list[Array], z: Array | None) -> Array:
         law = _with(e, values)
@@ -433,10 +433,10 @@ def _memories(
     v: Float[Array, " N"],
     at_ports: PortResponses,
 ) -> list[Float[Array, "2 N S"] | None]:
-    """States of memories at both evaluations of each step, by shape; of other effects None."""
+    """States of memories at both evaluations of each step, for each shape; None for other effects."""
     if not all(isinstance(e, Memory) for e in effects):
         return [None] * len(effects)
-    # Motion is held in the middle of the step, which is linear in the states at both evaluations.
+    # The motion is held at the middle of the step: at the mean of both evaluations, as it is linear in them.
     middle = jnp.mean(at_ports.motion, axis=2)
     rest = [
         jnp.full(len(values), e.initial(), v.dtype) for e, values in zip(effects, laws.values, strict=True)
@@ -474,18 +474,18 @@ def signal_sensitivities(
 ) -> Float[Array, "D N C"]:
     """Derivatives of the predicted outputs along effects on the voltage and on readings.
 
-    What else is in the model enters by the responses alone, so that one program serves all models.
+    The rest of the model enters through the responses alone, so that one program serves all models.
 
     Args:
-        structure: All effects on the voltage and on readings; static. Those that the directions
+        structure: All effects on the voltage and on readings; static. Effects that the directions
             move have no states.
         solver: Integration rule; static.
         values: Parameter values at which each direction is tried.
-        gates: Gates there.
+        gates: Gates at which each direction is tried.
         dvalues: Directions in the values.
         dgates: Directions in the gates.
         samples: The recording.
-        responses: From `run_responses`, the states of the run those of this structure.
+        responses: From `run_responses`; the states of its run are those of this structure.
     """
     N, x, ideal = len(responses.ideal), responses.run.X.T, responses.ideal.T
 
@@ -501,7 +501,7 @@ def signal_sensitivities(
         return jax.vmap(one, out_axes=-1)(values, gates, dvalues, dgates)
 
     dv, dy = slopes(voltage), slopes(reading)
-    to_voltage = responses.to_voltage[:, : dv.shape[1]]  # signals beside it follow
+    to_voltage = responses.to_voltage[:, : dv.shape[1]]  # signals come after the voltage
     response = jnp.concatenate([to_voltage, responses.to_reading], axis=1)
     (later,) = _recursion(responses, [(response, jnp.concatenate([dv, dy], axis=1))])
     return jnp.moveaxis(later + dy, -1, 0)
@@ -510,11 +510,12 @@ def signal_sensitivities(
 def _recursion(
     responses: RunResponses, forced: list[tuple[Float[Array, "N _ n"], Float[Array, "N _ _"]]]
 ) -> list[Float[Array, "N C _"]]:
-    """Changes of the readings under forcings of the run; the directions last, for the vector units.
+    """Changes of the readings under forcings of the run, with the directions last for the vector units.
 
     Args:
-        responses: Of the run.
-        forced: Response of the state to some quantities, and what these are along some directions.
+        responses: Responses of the run.
+        forced: For each forcing: response of the state to some quantities, and the change of these
+            quantities along some directions.
     """
 
     def body(states: list[Array], here: Any) -> tuple[list[Array], list[Array]]:

@@ -1,4 +1,4 @@
-"""The state at the start of a recording from its first samples, by least squares through the simulator."""
+"""The state at the start of a recording, fitted to its first samples by least squares with the simulator."""
 
 import jax
 import jax.numpy as jnp
@@ -15,26 +15,26 @@ from rotflex_jax.optimise.damped_least_squares import NormalEquations, Rules, mi
 from rotflex_jax.runtime.persistent_jit import persistent_jit
 from rotflex_jax.runtime.xla import double_precision
 
-# Rows of the arrays of a call at least: calls with fewer segments share one program.
+# Least number of rows of the arrays of a call: calls with fewer segments share one program.
 LEAST_ROWS = 64
 # Increment of a state for a difference quotient.
 DIFFERENCE = 1e-6
-# Evaluations of one segment at most.
+# Largest number of evaluations of one segment.
 MAX_EVALUATIONS = 25
-# Near a stop of friction difference quotients are rough, and with less damping some segments end elsewhere
-# than at the least error; directions that a segment does not determine stay where they are.
+# Where friction stops the motion, difference quotients are inaccurate, and with less damping some fits do not
+# end at the least error. Directions that a segment does not determine stay at their guess.
 RULES = Rules(enough_share=1e-14, least=1e-6)
 
 
 def rough_states(structure: Mechanism, y: Float[np.ndarray, "W N C"], Ts: float) -> Float[np.ndarray, "W s"]:
     """Positions and speeds at the start of W segments, from straight lines through their samples.
 
-    What the sensors do not determine follows from the springs, which are relaxed, and is zero where there is
-    none. Speeds come from the slopes of positions before they come from sensors of speed, whose sign a
-    rectifier may hide.
+    Coordinates that the sensors do not determine are set so that the springs are relaxed, and to zero where
+    there is no spring. Speeds come from the slopes of positions first, and then from speed sensors, whose
+    sign a rectifier may hide.
 
     Args:
-        structure: Mechanism.
+        structure: Mechanism without parameter values.
         y: Samples of the outputs.
         Ts: Sampling period [s].
     """
@@ -55,7 +55,7 @@ def rough_states(structure: Mechanism, y: Float[np.ndarray, "W N C"], Ts: float)
 
 
 def _lexicographic_fit(rows: list[tuple[np.ndarray, np.ndarray]], n: int) -> Float[np.ndarray, "n W"]:
-    """The smallest `X` with `A X = B` for the first pair, then for the next as far as it is undetermined."""
+    """The smallest `X` with `A X = B` for the first pair, then for the next as far as `X` is undetermined."""
     X, free = np.zeros((n, rows[0][1].shape[1])), np.eye(n)
     for A, B in rows:
         left = A @ free
@@ -79,14 +79,14 @@ def _fitted_states(
 ) -> Array:
     """Positions and speeds (W, m) with the least squared error, each of the first `count` segments by itself.
 
-    They are fitted one after another: each stops where it has converged, and a shortcut through a step has
-    to suffice for the runs of one segment only. Rows from `count` on return their guess. Slopes are
-    difference quotients: segments are short, and the derivative of the simulation would take longer to
+    The segments are fitted one after another: each fit stops when it has converged, and a shortcut through a
+    step has to hold for the runs of one segment only. Rows from `count` on return their guess. Derivatives
+    are difference quotients: segments are short, and the derivative of the simulation would take longer to
     compile than all the runs take.
     """
     m = guess.shape[1]
     increments = jnp.concatenate([jnp.zeros((1, m)), DIFFERENCE * jnp.eye(m)])
-    # Formed once, outside of the minimisation, whose loop would have to be traced with them.
+    # Formed once, outside of the minimisation, so that they are not traced within its loop.
     mechanism, constants = structure.with_values(values), solver.prepare(structure, values, gates, Ts)
 
     def with_fitted(k: Array, found: Array) -> Array:
@@ -116,8 +116,8 @@ def initial_states(
 ) -> Float[np.ndarray, "W n"]:
     """First states of W segments of a recording, each by itself.
 
-    Positions and speeds are fitted; errors of the channels are weighted in their own units. States that no
-    sensor measures (memories, motor current, modes of a part) are given.
+    Positions and speeds are fitted; the error of each channel counts in its own unit. States that no sensor
+    measures (memories, motor current, modes of a part) are given.
 
     Args:
         mechanism: Model.
@@ -126,14 +126,14 @@ def initial_states(
         u: Voltage [V], and the signals of the mechanism beside it.
         y: Measured outputs.
         Ts: Sampling period [s].
-        hidden: The states after positions and speeds; at rest if None.
+        hidden: The states other than positions and speeds; at rest if None.
     """
     structure = mechanism.structure
     if hidden is None:
         rest = rest_state(structure, np.float64)[2 * Layout.of(structure).n :]
         hidden = np.tile(rest, (len(u), 1))
     guess = rough_states(structure, y, Ts)
-    # Rows beyond the segments are not evaluated; with them few shapes are compiled for.
+    # Rows beyond the segments are not evaluated; they keep the number of compiled shapes small.
     rows = np.minimum(np.arange(max(LEAST_ROWS, 2 ** (len(u) - 1).bit_length())), len(u) - 1)
     with double_precision():
         segments = map(jnp.asarray, (guess[rows], hidden[rows], u[rows], y[rows], np.float64(Ts)))

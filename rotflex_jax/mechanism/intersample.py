@@ -1,8 +1,8 @@
 """Intersample behaviour of the voltage: held by a converter, band-limited, or switched within the samples.
 
 A converter holds each value until the next. Behind a delay the voltage switches within the sample, which
-counts where hundredths of a sample are distinguished (`assembly.voltage_within_samples`). A signal that was
-measured behind a low-pass filter is determined between its samples by the samples (Shannon); a step in
+matters where delays are resolved to hundredths of a sample (`assembly.voltage_within_samples`). A signal that
+was measured behind a low-pass filter is determined between its samples by the samples (Shannon); a step in
 substeps uses the mean of that curve over each substep. Holding a mean loses amplitude at high frequencies,
 which the weights restore.
 """
@@ -16,13 +16,13 @@ from jaxtyping import Array, Float
 
 Intersample = Literal["held", "smooth", "switched"]
 KERNEL_HALF_WIDTH = 24
-"""Samples on either side that have a weight: that of the ideal low-pass under a Kaiser window."""
+"""Samples on either side that have a weight: the weight of an ideal low-pass filter with a Kaiser window."""
 KAISER_SHAPE = 8.0
 
 
 @functools.cache
 def interpolation_weights(substeps: int) -> Float[np.ndarray, "substeps W"]:
-    """Weights of the W samples -KERNEL_HALF_WIDTH + 1 ... KERNEL_HALF_WIDTH about the start of a sample.
+    """Weights of the W samples -KERNEL_HALF_WIDTH + 1 ... KERNEL_HALF_WIDTH around the start of a sample.
 
     >>> bool(np.all(np.abs(interpolation_weights(4).sum(axis=1) - 1) < 1e-4))
     True
@@ -39,7 +39,7 @@ def interpolation_weights(substeps: int) -> Float[np.ndarray, "substeps W"]:
 
 
 def substep_voltages(v: Float[Array, " N"], substeps: int) -> Float[Array, "N substeps"]:
-    """Voltage of a band-limited signal over each substep; constant beyond its ends."""
+    """Voltage of a band-limited signal over each substep; before and after the signal it is constant."""
     N = v.shape[0]
     ends = jnp.concatenate([jnp.full(KERNEL_HALF_WIDTH - 1, v[0]), v, jnp.full(KERNEL_HALF_WIDTH, v[-1])])
     kernel = jnp.asarray(interpolation_weights(substeps), v.dtype)

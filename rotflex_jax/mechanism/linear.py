@@ -1,4 +1,4 @@
-"""The linear part of a mechanism as state space, its states by name, and its steady Kalman gain."""
+"""The linear part of a mechanism as a state-space model, names of its states, and its steady Kalman gain."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -17,7 +17,7 @@ from rotflex_jax.runtime.xla import double_precision
 
 
 def check_movable(mechanism: Mechanism) -> None:
-    """Raise `InputError` where a coordinate has no inertia; for a complete mechanism."""
+    """Raise `InputError` if a coordinate of a complete mechanism has no inertia."""
     n = len(mechanism.coordinates)
     linear = [(e.stamp(), e.at) for _, e in effects_of(mechanism, Linear)]
     rows = [np.sqrt(abs(float(s.inertia))) * np.array(mechanism.port_vectors[at]) for s, at in linear]
@@ -86,11 +86,11 @@ def zero_order_hold(
 
 
 def _exponential(A: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
-    """`e^A`; not a number where double precision leaves no correct digit of it.
+    """`e^A`; NaN where double precision leaves no correct digit of it.
 
     The relative error grows as `eps |A|` (Moler and Van Loan, SIAM Rev. 45, 2003). Parameters far outside
     their physical ranges give such an `A`. SciPy then returns arbitrary entries, or raises where a pivot
-    happens to be zero, which depends on the processor. A model with such a gain counts as one that diverges.
+    happens to be zero, which depends on the processor. With NaN the model counts as one that diverges.
     """
     if not np.linalg.norm(A, 1) * np.finfo(float).eps < 1:
         return np.full_like(A, np.nan)
@@ -116,15 +116,15 @@ def inverse_mass(mechanism: Mechanism) -> Float[np.ndarray, "n n"]:
 
 
 def linearise(mechanism: Mechanism) -> StateSpace:
-    """State space of the linear effects (inertias, springs, dampers, motor), without all others.
+    """State-space model of the linear effects (inertias, springs, dampers, motor) alone.
 
-    Dry friction and a dead zone have no slope at rest, so the linear model of a joint has none of them.
+    All other effects are left out: dry friction and a dead zone, for instance, have no slope at rest.
     """
     return _linearised(mechanism)[0]
 
 
 def _linearised(mechanism: Mechanism) -> tuple[StateSpace, np.ndarray]:
-    """State space of the linear effects, and the inverse mass matrix."""
+    """State-space model of the linear effects, and the inverse of the mass matrix."""
     check_mechanism(mechanism)
     check_movable(mechanism)
     layout = Layout.of(mechanism.structure)
@@ -150,13 +150,14 @@ def kalman_gains(
     the noise, so its variance grows without bound, while its covariance with the outputs has a limit.
 
     Args:
-        mechanism: Its linear part is used.
-        intensities: Port -> intensity of the white torque [(N m)^2 s]; all zero gives a zero gain.
-        noise: Standard deviation of the sensor noise per channel.
+        mechanism: Only its linear part is used.
+        intensities: For each gain: port -> intensity of the white torque [(N m)^2 s]; all zero gives a zero
+            gain.
+        noise: Standard deviation of the sensor noise of each channel.
         Ts: Sampling period [s].
 
     Returns:
-        Gains with zero rows for memories.
+        One gain for each of the `intensities`, with zero rows for the states of memories.
     """
     layout, (ss, Minv) = Layout.of(mechanism.structure), _linearised(mechanism)
     n, size = layout.n, layout.linear
@@ -189,21 +190,21 @@ def kalman_gains(
 
 
 NOISE_DOUBLINGS = 14
-"""How often a sample is halved for a first step, whose covariance is doubled as often."""
+"""How often the sampling period is halved for the first step, and the step then doubled again."""
 
 
 def process_covariance(
     A: Float[np.ndarray, "m m"], push: Float[np.ndarray, "*batch n"], n: int, Ts: float
 ) -> Float[np.ndarray, "*batch m m"]:
-    """Covariance of the state after one sample of a white torque of unit intensity; of several at once.
+    """Covariance of the state after one sample of a white torque of unit intensity, for several torques.
 
     `Q(2 h) = Q(h) + E Q(h) E'` from a Simpson rule over the smallest step; this has, in contrast to the
     usual block exponential, no growing mode, so a fast electrical pole costs no accuracy.
 
     Args:
         A: State matrix.
-        push: What the torque adds to the slopes of the speeds.
-        n: Number of coordinates; their speeds are the states from n on.
+        push: Acceleration of the coordinates by a unit torque, for each torque.
+        n: Number of coordinates; their speeds are the states n to 2 n - 1.
         Ts: Sampling period [s].
     """
     g = np.zeros((*np.shape(push)[:-1], len(A)))

@@ -1,4 +1,4 @@
-"""A mechanism: coordinates, named ports, effects at the ports, what the sensors see; checked when made."""
+"""A mechanism: coordinates, named ports, effects at the ports and outputs; checked when it is created."""
 
 import dataclasses
 import functools
@@ -24,7 +24,7 @@ from rotflex_jax.text.numbers import equation, unit_text
 
 
 def ports(given: Any) -> tuple[tuple[str, tuple[float, ...]], ...]:
-    """Name and vector of each port."""
+    """The ports as pairs of name and vector, checked."""
     try:
         found = tuple((str(name), tuple(float(c) for c in vector)) for name, vector in dict(given).items())
         if not all(math.isfinite(c) for _, vector in found for c in vector):
@@ -38,7 +38,7 @@ def ports(given: Any) -> tuple[tuple[str, tuple[float, ...]], ...]:
 
 
 def outputs(given: Any) -> tuple[tuple[str, tuple[str, str]], ...]:
-    """Channel, and port with the quantity measured there."""
+    """The outputs as pairs of channel and (port, measured quantity), checked."""
     if not isinstance(given, (Mapping, tuple)) or (given and isinstance(given, tuple) and len(given[0]) != 2):
         raise InputError(
             f"The outputs were given as {given!r}, but they are channels with the port that each measures; "
@@ -58,7 +58,7 @@ def outputs(given: Any) -> tuple[tuple[str, tuple[str, str]], ...]:
 
 
 def effects(given: Any) -> tuple[Effect, ...]:
-    """Effects in order."""
+    """The effects as a tuple, in their order, checked."""
     sequence = checks.entries(given)
     if sequence is None and not isinstance(given, Effect | type):
         raise InputError(f"The effects were given as {shown(given)}, but a list is needed; give one.")
@@ -77,7 +77,7 @@ def effects(given: Any) -> tuple[Effect, ...]:
 
 
 def process_noise_of(mechanism: "Mechanism", given: Any) -> dict[str, float]:
-    """Port -> intensity of a process torque, nothing for None; checked."""
+    """Port -> intensity of the process noise, checked; empty for None."""
     if not (given is None or isinstance(given, Mapping)):
         raise InputError(
             f"Argument `process_noise` must give an intensity for each port, but is {shown(given)}; write "
@@ -144,7 +144,7 @@ def check(mechanism: "Mechanism") -> None:
 
 
 def _check_surroundings(mechanism: "Mechanism", effect: Effect) -> None:
-    """What an effect needs at its port must be there, and of some kinds a mechanism has one at most."""
+    """Check that the port has what the effect needs, and that a `single` effect is alone of its kind."""
     name = type(effect).__name__
     if missing := mechanism.lacking(effect, effect.at):
         needed, added = (" and ".join(map(_with_article, names)) for names in (effect.needs(), missing))
@@ -169,7 +169,10 @@ def _with_article(noun: str) -> str:
 
 
 ROTOR = "rotor"
-"""Port on the motor's side of a gear with play, which a mechanism with such a gear has besides its own."""
+"""Name of the port on the motor's side of a gear with play.
+
+A mechanism with such a gear has this port in addition to its own ports.
+"""
 
 
 class _Slot:
@@ -179,7 +182,7 @@ class _Slot:
         return "·"
 
     def __reduce__(self) -> str:
-        return "_SLOT"  # the one and only, also in another process
+        return "_SLOT"  # the same single object, also in another process
 
 
 _SLOT = _Slot()
@@ -188,7 +191,10 @@ _SLOT = _Slot()
 @jax.tree_util.register_pytree_node_class
 @dataclasses.dataclass(frozen=True)
 class Mechanism:
-    """Coordinates `q`, ports `p` (position p.q, speed p.dq, torque tau acts as p tau), effects, outputs.
+    """A machine as coordinates `q`, ports `p`, effects at the ports, and outputs.
+
+    A port is a vector: its position is p.q, its speed is p.dq, and a torque tau at the port acts on the
+    coordinates as p tau.
 
         M ddq + D dq + K q = sum over ports of p tau,   y = outputs of (q, dq)
 
@@ -197,13 +203,14 @@ class Mechanism:
         ports: Name -> vector, one entry per coordinate.
         effects: Physical effects; inertias, springs, dampers and the motor among them.
         outputs: Channel -> port (its position) or (port, "speed").
-        trusted: Full names `port.effect.parameter` of constants that fits hold.
-        units: Units of its ports; rotary by default.
-        signals: Names of the measured signals that may drive its effects beside the input; those that its
-            effects name are added.
+        trusted: Full names `port.effect.parameter` of the parameters that a fit holds at their values.
+        units: Units of the ports; rotary by default.
+        signals: Names of the measured signals that may drive effects in addition to the input. The signals
+            that the effects name are added.
 
     Raises:
-        InputError: A port, output or trusted name that does not exist, or two equal effects at a port.
+        InputError: A port, an output or a trusted name does not exist, two equal effects are at one port, or
+            a port lacks what an effect needs.
 
     A mechanism is a pytree whose leaves are the parameter values, so it passes through `jax.jit` and
     `jax.grad`; `mechanism + effect` is a new mechanism.
@@ -227,7 +234,7 @@ class Mechanism:
         known = (*checks.names(self.signals, "signals"), *(e.signal for e in self.effects if e.signal))
         put("signals", tuple(dict.fromkeys(known)))
         check(self)
-        put("trusted", self.trusted | set(self.followers))  # a fit moves what they follow
+        put("trusted", self.trusted | set(self.followers))  # a fit moves the parameters that these follow
         for name in sorted(self.trusted):
             self._must_exist(name)
 
@@ -242,7 +249,10 @@ class Mechanism:
 
     @property
     def port_vectors(self) -> dict[str, tuple[float, ...]]:
-        """Port name -> vector over the coordinates; with a gear also its `rotor`, while the teeth touch."""
+        """Port name -> vector over the coordinates; with play in a gear also `rotor`.
+
+        The vector of `rotor` holds while the teeth touch.
+        """
         vectors = dict(self.ports)
         for e in self.effects:
             if e.state_part == "rotor" and e.at in vectors:
@@ -260,7 +270,7 @@ class Mechanism:
 
     @property
     def takes_signals(self) -> bool:
-        """Whether an effect is driven by a measured signal beside the input."""
+        """Whether a measured signal drives an effect, in addition to the input."""
         return any(e.signal for e in self.effects)
 
     @property
@@ -302,7 +312,7 @@ class Mechanism:
         raise InputError(f"{name!r} at {at!r} was asked for, but the mechanism lacks it; add it first.")
 
     def locations(self, effect: Effect | type[Effect]) -> tuple[str, ...]:
-        """Where an effect can act here: the ports, the voltage (`input`), or the outputs."""
+        """Where an effect can act: the ports, ports with a signal, the voltage (`input`), or the outputs."""
         if effect.acts_on == "input":
             return ("input",)
         if effect.acts_on == "signal":
@@ -310,7 +320,7 @@ class Mechanism:
         return self.channels if effect.acts_on == "channel" else tuple(self.port_vectors)
 
     def vector(self, effect: Effect) -> tuple[float, ...]:
-        """Vector of the port at which an effect acts, of a sensor of the port that it measures."""
+        """Vector of the port at which an effect acts; for a sensor, of the port that it measures."""
         port = dict(self.outputs)[effect.at][0] if effect.acts_on == "channel" else effect.port
         return self.port_vectors[port]
 
@@ -323,7 +333,7 @@ class Mechanism:
         return [e for e in self.effects if isinstance(e, Linear) and e.at == port]
 
     def lacking(self, effect: Effect | type[Effect], port: str) -> list[str]:
-        """What an effect needs at a port or an output that is not there: `motor`, `inertia`, ..."""
+        """What an effect needs at a port or an output but does not find there: `motor`, `inertia`, ..."""
         has: dict[str, Callable[[str], bool]] = {
             "motor": self.has_motor,
             "inertia": self.has_inertia,
@@ -347,11 +357,11 @@ class Mechanism:
         return any(e.motor for e in self.linear_effects(port))
 
     def has_inertia(self, port: str) -> bool:
-        """Whether an inertia is entered at the port."""
+        """Whether an effect at the port has an inertia."""
         return any(e.inertial for e in self.linear_effects(port))
 
     def with_signals(self, names: Sequence[str]) -> "Mechanism":
-        """The mechanism with these signals, and those that its effects take, to drive effects."""
+        """The mechanism with these signals to drive effects; signals that its effects name are kept."""
         return dataclasses.replace(self, signals=tuple(names))
 
     # -- parameters --------------------------------------------------------------------------------
@@ -363,13 +373,13 @@ class Mechanism:
 
     @functools.cached_property
     def followers(self) -> dict[str, str]:
-        """Full name of each parameter that always equals another one -> full name of the other."""
+        """Full name of each tied parameter -> full name of the parameter that it always equals."""
         heads = ((e.name_prefix, e.follows) for e in self.effects)
         return {head + name: head + other for head, follows in heads for name, other in follows.items()}
 
     @functools.cached_property
     def parameter_specifications(self) -> tuple[Specification, ...]:
-        """Unit, bounds and size of each parameter, in the order of `values`."""
+        """Unit, bounds and typical size of each parameter, in the order of `values`."""
         u = self.units
         return tuple(
             dataclasses.replace(s, unit=u.of(e, s.unit), typical=s.typical * u.size(s.unit))
@@ -397,7 +407,7 @@ class Mechanism:
 
     @property
     def free_names(self) -> tuple[str, ...]:
-        """Parameters that a fit estimates, all but the trusted ones."""
+        """Parameters that a fit estimates: all except the trusted ones."""
         return tuple(n for n in self.parameter_names if n not in self.trusted)
 
     def with_values(
@@ -409,7 +419,8 @@ class Mechanism:
                 self._must_exist(name)
             old = self.named_values
             for name in self.followers:
-                # Beside a value of what it follows it may stand as it was: the whole vector by name.
+                # `values` may name all parameters: a tied one may keep its old value, or take the same new
+                # value as the parameter that it follows.
                 own = values.get(name, old[name])
                 if own != old[name] and own != values.get(self.followers[name]):
                     self._refuse_follower(name)
@@ -432,9 +443,9 @@ class Mechanism:
         return self._with_numbers(tuple(effects), self.trusted)
 
     def _with_numbers(self, effects: tuple[Effect, ...], trusted: frozenset[str]) -> "Mechanism":
-        """The same mechanism where only numbers of its effects differ: what was checked need not be again."""
+        """The same mechanism with other numbers in its effects, without the checks of a new mechanism."""
         rebuilt = object.__new__(type(self))
-        # What follows from the structure alone, where it is known, is that of the other one too.
+        # Cached properties that depend on the structure alone are taken over.
         known = ("structure", "parameter_names", "followers", "parameter_specifications")
         rebuilt.__dict__.update({name: self.__dict__[name] for name in known if name in self.__dict__})
         fields = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
@@ -463,7 +474,7 @@ class Mechanism:
     # -- pytree ------------------------------------------------------------------------------------
 
     def tree_flatten(self) -> tuple[list[Any], Any]:
-        """Leaves are the parameter values."""
+        """The leaves are the parameter values."""
         return [v for e in self.effects for v in e.values.values()], (self.structure, self.trusted)
 
     @classmethod
@@ -483,7 +494,7 @@ class Mechanism:
         return "held" if name in self.trusted else ""
 
     def _repr_html_(self) -> str:
-        """Ports and effects with their equations, and every parameter with unit and value."""
+        """Ports, effects with their equations, and every parameter with its unit and value."""
         vectors = ((name, ", ".join(f"{v:g}" for v in p)) for name, p in self.port_vectors.items())
         effects = [(effect_label(e.name, e.at), equation(e.equation)) for e in self.effects]
         described = zip(self.parameter_names, self.parameter_specifications, self.values, strict=True)
@@ -511,7 +522,7 @@ class Mechanism:
 
 
 def check_mechanism(given: Any) -> None:
-    """Raise `InputError` where something else was given as a mechanism."""
+    """Raise `InputError` if the argument is not a mechanism."""
     if not isinstance(given, Mechanism):
         raise InputError(
             f"A mechanism or a model is needed, but {shown(given)} was given; give for instance "
@@ -520,7 +531,7 @@ def check_mechanism(given: Any) -> None:
 
 
 def check_input_alone(mechanism: Mechanism, what: str) -> None:
-    """Raise `InputError` where a measured signal drives an effect beside the input, which `what` has not."""
+    """Raise `InputError` if a measured signal drives an effect, since `what` has the input alone."""
     driven = next((e for e in mechanism.effects if e.signal), None)
     if driven is not None:
         raise InputError(

@@ -1,13 +1,13 @@
-"""What an output measures at its port, and the units of machines that turn or do not turn.
+"""What an output measures at its port, and the units of rotary and other machines.
 
-Effects speak of a turning port: angles in rad, torques in N m. A machine may say that its ports move
-otherwise, in metres under forces in newtons, or in volts under volts; then every unit follows by
-dimensions, and sentences speak of forces.
+Effects are written for a port that turns: angles in rad, torques in N m. The ports of a machine may have
+other units, such as metres and newtons, or volts and volts. Every other unit then follows by dimensions, and
+sentences speak of forces.
 
-A reading that is no linear combination of positions and speeds has a row of zeros here. The current of
-a motor and the duty of a servo are states of effects that show them (`Memory.shows`); another reading would
-have its equation in `mechanism/simulate.py`. An acceleration is more: it depends on the torques, which no
-reading receives.
+A reading that is no linear combination of positions and speeds has a row of zeros here. The current of a
+motor and the duty of a servo are states of effects that show them (`Memory.shows`); another reading would
+have its equation in `mechanism/simulate.py`. An acceleration cannot be a reading: it depends on the torques,
+which no reading receives.
 """
 
 import enum
@@ -30,9 +30,9 @@ class Units(NamedTuple):
     Attributes:
         motion: Unit of a port's position.
         effort: Unit of the force or torque.
-        motion_size: Typical size of its positions, relative to the radians of a small joint.
-        effort_size: The same for the force or torque, relative to newton metres.
-        input: Unit of the input that drives it, where that is no voltage: of a goal angle, of a current.
+        motion_size: Typical size of a position in its unit, relative to the radians of a small joint.
+        effort_size: Typical size of a force or torque in its unit, relative to newton metres.
+        input: Unit of the input: V for a voltage, otherwise the unit of a goal angle or of a current.
     """
 
     motion: str = "rad"
@@ -45,9 +45,9 @@ class Units(NamedTuple):
         """The unit of this machine for a unit that an effect declares.
 
         Args:
-            declared: As the effect has it.
-            of_input: Whether its volts are the unit of the input, whatever that is.
-            per: Unit of the signal by which it is divided, which is the same for any machine.
+            declared: Unit that the effect declares.
+            of_input: Whether the volts in it stand for the unit of the input.
+            per: Unit of the signal by which the unit is divided; the same for any machine.
 
         >>> Units("m", "N").unit("N m s/rad"), Units("m", "N").unit("kg m^2")
         ('N s/m', 'kg')
@@ -75,20 +75,20 @@ class Units(NamedTuple):
         return _written(whole)
 
     def of(self, effect: Effect, declared: str) -> str:
-        """The unit of this machine for a unit that a parameter of an effect declares."""
+        """The unit of this machine for the declared unit of a parameter of an effect."""
         return self.unit(declared, effect.volts_of_input, effect.signal_unit)
 
     def size(self, declared: str) -> float:
-        """Factor on a typical size that an effect declares, for this machine."""
+        """Factor for this machine on a typical size that an effect declares in this unit."""
         powers = _powers(declared)
         return self.effort_size ** powers.get("N m", 0) * self.motion_size ** powers.get("rad", 0)
 
     def sentence(self, text: str, of_input: bool = False) -> str:
-        """What an effect says of itself, in the units and words of this machine.
+        """The sentence of an effect, in the units and words of this machine.
 
         Args:
-            text: As the effect says it.
-            of_input: Whether its volts are the unit of the input, whatever that is.
+            text: Sentence of the effect.
+            of_input: Whether the volts in it stand for the unit of the input.
 
         >>> Units("m", "N").sentence("the axis meets a torque of 20 N m whichever way it turns")
         'the axis meets a force of 20 N whichever way it moves'
@@ -110,7 +110,7 @@ TURNING = Units()
 
 
 def _powers(unit: str) -> dict[str, int]:
-    """Factors of a unit and their powers; an inertia as torque per angular acceleration.
+    """Factors of a unit and their powers; an inertia is a torque per angular acceleration.
 
     >>> _powers("N m s^2/rad^2"), _powers("kg m^2")
     ({'N m': 1, 's': 2, 'rad': -2}, {'N m': 1, 's': 2, 'rad': -1})
@@ -134,11 +134,11 @@ def _written(powers: dict[str, int]) -> str:
 
 
 class Quantity(enum.Enum):
-    """A measured quantity of a port; its value is the name that outputs are given with.
+    """A measured quantity of a port; its value is the name by which an output gives it.
 
     Attributes:
-        derivative: Order of the time derivative of the port's position; 2, as of a torque, for a reading of
-            the motor.
+        derivative: Order of the time derivative of the port's position; for a reading of the motor 2, as for
+            a torque.
 
     >>> Quantity("speed").derivative, Quantity("speed").unit(Units("m", "N"))
     (1, 'm/s')
@@ -164,16 +164,16 @@ class Quantity(enum.Enum):
 
     @property
     def is_position(self) -> bool:
-        """Whether it is the position itself."""
+        """Whether the quantity is the position itself."""
         return self.derivative == 0
 
     @property
     def of_motion(self) -> bool:
-        """Whether it is a linear function of positions and speeds."""
+        """Whether the quantity is a linear function of positions and speeds."""
         return self.derivative <= 1
 
     def unit(self, units: Units) -> str:
-        """Unit of the reading for a machine that moves in these units."""
+        """Unit of the reading for a machine with these units."""
         if not self.of_motion:
             return "A" if self is Quantity.CURRENT else ""
         return units.motion + ("", "/s")[self.derivative]

@@ -1,8 +1,9 @@
 """Arithmetic on arrays that are repeated along their last axis, done once.
 
 A run that carries its derivatives has the state repeated along the directions, so that one expression serves
-state and tangents. What is the same along that axis is computed once here and repeated where it meets what is
-not. XLA would move the repetition through a step by itself, one operation in each of its passes.
+state and tangents. A value that is the same along that axis is computed once here, and repeated only where it
+meets a value that is not. XLA would do this by itself, but move the repetition by only one operation in each
+of its passes.
 """
 
 from collections.abc import Callable, Sequence
@@ -13,7 +14,7 @@ import jax.numpy as jnp
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 from jaxtyping import Array
 
-# Operations whose result at a place depends on the operands at that place alone.
+# Elementwise operations: the result at an index depends on the operands at that index alone.
 # fmt: off
 _BY_PLACE = {
     "abs", "add", "add_any", "and", "atan2", "clamp", "convert_element_type", "copy", "cos", "cosh",
@@ -22,12 +23,12 @@ _BY_PLACE = {
     "rsqrt", "select_n", "sign", "sin", "sinh", "sqrt", "square", "sub", "tan", "tanh", "xor",
 }
 # fmt: on
-# Reductions that give the same for one copy as for several.
+# Reductions that give the same result for one copy as for several.
 _SAME_OF_COPIES = {"reduce_and", "reduce_max", "reduce_min", "reduce_or"}
 
 
 class _Once:
-    """An array that is repeated along its last axis, as it is with a last axis of one."""
+    """An array that is repeated along its last axis, stored once with a last axis of length one."""
 
     def __init__(self, once: Array) -> None:
         self.once = once
@@ -37,9 +38,9 @@ def without_repetition(function: Callable[..., Any], length: int, repeated: Any,
     """`function(repeated, other)` with the arithmetic on repeated arrays done once.
 
     Args:
-        function: Of two pytrees of arrays.
-        length: Of the last axis of each array of both.
-        repeated: Arrays (..., 1) that the function gets repeated along their last axis (..., length).
+        function: Function of two pytrees of arrays.
+        length: Length of the last axis of all arrays that the function receives.
+        repeated: Arrays (..., 1) that the function receives repeated along their last axis (..., length).
         other: Arrays (..., length).
     """
     shapes = jax.tree.map(lambda a: jax.ShapeDtypeStruct((*a.shape[:-1], length), a.dtype), repeated)
@@ -70,7 +71,7 @@ def _evaluated(jaxpr: Jaxpr, consts: Sequence[Any], given: Sequence[Any], length
 
 
 def _branched(branches: Sequence[ClosedJaxpr], operands: Sequence[Any], length: int) -> list[Any]:
-    """Results of the branch that the first operand chooses, `_Once` where all branches repeat them."""
+    """Results of the branch that the first operand chooses; `_Once` where all branches repeat them."""
     index, *given = operands
     repeated = [isinstance(x, _Once) for x in given]
     arrays = [x.once if once else x for x, once in zip(given, repeated, strict=True)]
@@ -99,7 +100,7 @@ def _branched(branches: Sequence[ClosedJaxpr], operands: Sequence[Any], length: 
 
 
 def _applied(equation: Any, operands: list[Any], length: int) -> list[Any]:
-    """Results of one operation, `_Once` where they are known to be repeated."""
+    """Results of one operation; `_Once` where they are known to be repeated."""
     primitive, params = equation.primitive, equation.params
     if primitive.name in _SAME_OF_COPIES and isinstance(operands[0], _Once):
         array = operands[0].once
@@ -108,7 +109,7 @@ def _applied(equation: Any, operands: list[Any], length: int) -> list[Any]:
     changed = _changed(primitive.name, params, operands, length)
     if changed is None:
         bound = primitive.get_bind_params(params)
-        # Older versions of JAX give functions beside.
+        # Older versions of JAX return functions as well.
         functions, bound = bound if isinstance(bound, tuple) else ((), bound)
         result = primitive.bind(*functions, *(_whole(x, length) for x in operands), **bound)
         return list(result) if primitive.multiple_results else [result]
@@ -117,9 +118,9 @@ def _applied(equation: Any, operands: list[Any], length: int) -> list[Any]:
 
 
 def _changed(name: str, params: dict[str, Any], operands: list[Any], length: int) -> dict[str, Any] | None:
-    """What changes in the parameters of an operation where the last axis is one.
+    """Changes of the parameters of an operation when the last axis has length one.
 
-    None where the result is not known to be repeated.
+    None if the result is not known to be repeated.
     """
     if name == "broadcast_in_dim":
         shape, axes, x = params["shape"], params["broadcast_dimensions"], operands[0]

@@ -1,9 +1,9 @@
 """Roles of the ports and sensors of any machine, in the names of the flexible joint.
 
-An effect names the places where a search tries it by the ports of that joint: the driven `hub`, the elastic
-`joint`, the `arm` that is carried along; the sensor `theta` of the absolute angle and the sensor `alpha` of
-anything else. Ports and channels with other names get these roles by the effects at them, so that an effect
-needs no list of machines and a machine none of effects.
+An effect names the places where a search tries it by the ports and sensors of that joint: the driven `hub`,
+the elastic `joint`, the `arm` that is carried along; the sensor `theta` of the absolute angle, and the sensor
+`alpha` of anything else. Ports and channels with other names get these roles from the effects at them, so
+that no effect needs a list of machines, and no machine a list of effects.
 """
 
 from collections.abc import Callable
@@ -18,10 +18,11 @@ PORTS, SENSORS = ("hub", "arm", "joint"), ("theta", "alpha")
 def port_roles(mechanism: Mechanism, port: str) -> set[str]:
     """Roles of a port: its own name if the joint has one of that name, otherwise by the effects at it.
 
-    A motor makes it a `hub`, a spring a `joint`, and neither an `arm`; one that moves in metres is an
-    `axis` as well. A motor that turns a weight is `loaded`, unless the model has the friction of a loaded
-    gear, or play, there already. A machine that has a hub, a joint and an arm by name says with them where
-    it is searched: its other ports have no role but that. Neither has the motor's side of a gear with play.
+    A port with a motor is a `hub`, a port with a spring a `joint`, and a port with neither an `arm`. A port
+    that moves in metres is an `axis` as well. A port where a motor turns a weight is `loaded`, unless the
+    model already has a friction that depends on the load, or play, there. If the machine has ports named
+    `hub`, `joint` and `arm`, its other ports have no role except `loaded`. The same holds for the motor's
+    side of a gear with play.
     """
     here = [e for e in mechanism.effects if e.at == port]
     weight = any(isinstance(e, Gravity) for e in here)
@@ -39,9 +40,10 @@ def port_roles(mechanism: Mechanism, port: str) -> set[str]:
 
 
 def sensor_role(mechanism: Mechanism, channel: str) -> str:
-    """Role of a sensor: `theta` for the first of a position that no spring holds, else `alpha`.
+    """Role of a sensor: `theta` for the first that measures a position without a spring, else `alpha`.
 
-    A position that no spring holds has no zero of its own, and all gains are relative to its sensor's.
+    A position that no spring holds has no zero of its own. The gains of the other sensors are relative to the
+    gain of its sensor.
     """
     if channel in SENSORS:
         return channel
@@ -84,10 +86,10 @@ def _places(mechanism: Mechanism, cls: type[Effect]) -> list[str]:
     }
     roles = {place: read[cls.acts_on](place) for place in mechanism.locations(cls)}
     wanted = set(cls.searched)
-    # A place that the effect itself names comes in its order, others in the machine's.
+    # Places that the effect names come in the order of the effect, others in the order of the machine.
     named = [place for place in cls.searched if place in roles]
     others = [place for place, role in roles.items() if place not in named and (role | {place}) & wanted]
-    # A sensor of a speed, say, has no error that depends on an angle.
+    # A speed sensor, for instance, has no error that depends on an angle.
     fits = lambda place: cls.acts_on != "channel" or not mechanism.lacking(cls, place)  # noqa: E731
     return [place for place in named + others if fits(place)]
 
@@ -95,8 +97,8 @@ def _places(mechanism: Mechanism, cls: type[Effect]) -> list[str]:
 def calibrations(mechanism: Mechanism) -> list[tuple[str, str]]:
     """Calibrations (effect, location) that each recording has, independent of the physics.
 
-    An offset of the voltage, and a bias of every sensor that has a zero of its own; not of a single sensor
-    of speed, whose bias is equivalent to the offset.
+    These are an offset of the voltage, and a bias of every sensor with the role `alpha`. A single speed
+    sensor has no bias, because its bias is equivalent to the offset.
     """
     alone = len(mechanism.outputs) == 1
     biased = [

@@ -26,7 +26,7 @@ from jaxtyping import Array, Float, Shaped
 BLOCK_SAMPLES = 32
 """Length of a block: shorter ones make the scan longer, longer ones the products larger."""
 BLOCKED_FROM_SAMPLES = 8 * BLOCK_SAMPLES
-"""Shorter runs are quicker sample by sample."""
+"""Runs of at least this length are evaluated in blocks; shorter runs are faster sample by sample."""
 
 
 def linear_outputs(
@@ -37,9 +37,9 @@ def linear_outputs(
     Not for a time-varying linear step, such as a predictor that skips the correction of some samples.
 
     Args:
-        step: Linear in state and inputs; takes several states side by side, as in `states`.
+        step: Step that is linear in state and inputs; takes several states side by side, as in `states`.
         x0: First state.
-        inputs: Of each sample (N,) or (N, m).
+        inputs: Inputs of each sample, (N,) or (N, m).
         constants: Passed to every step.
         C: Output matrix.
     """
@@ -64,7 +64,7 @@ def linear_outputs(
 
 
 def _powers(E: Float[Array, "n n"]) -> Float[Array, "K n n"]:
-    """`E^0` to `E^BLOCK_SAMPLES`, twice as many with every product."""
+    """`E^0` to `E^BLOCK_SAMPLES`; each product doubles their number."""
     powers, top = jnp.eye(len(E), dtype=E.dtype)[None], E
     while len(powers) < BLOCK_SAMPLES:
         powers = jnp.concatenate([powers, powers @ top])
@@ -78,7 +78,7 @@ StepFunction = Callable[[Float[Array, "n *S"], Any, Any], Float[Array, "n *S"]]
 def states(step: StepFunction, x0: Float[Array, " n"], inputs: Any, constants: Any) -> Float[Array, "N n"]:
     """States at the samples: row 0 is `x0`, row k + 1 is `step(row k, inputs[k], constants)`.
 
-    A step with the attribute `linear` set is evaluated in blocks where the run is long.
+    If the attribute `linear` of the step is set and the run is long, it is evaluated in blocks.
 
     Args:
         step: Pure function; hashable, so that equal structures share one compilation. It takes one state
@@ -94,7 +94,7 @@ def states(step: StepFunction, x0: Float[Array, " n"], inputs: Any, constants: A
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _stepped(step: StepFunction, x0: jax.Array, inputs: Any, constants: Any) -> jax.Array:
-    """Sample by sample."""
+    """States at the samples, computed sample by sample."""
 
     def body(x: jax.Array, w: Any) -> tuple[jax.Array, jax.Array]:
         return step(x, w, constants), x
@@ -103,7 +103,7 @@ def _stepped(step: StepFunction, x0: jax.Array, inputs: Any, constants: Any) -> 
 
 
 CHUNK_SAMPLES = 512
-"""Samples that are differentiated side by side: enough for the vector units, few enough for the cache."""
+"""Samples that are differentiated together: enough for the vector units, few enough for the cache."""
 
 
 def split_into_chunks(tree: Any) -> Any:
@@ -120,7 +120,7 @@ def split_into_chunks(tree: Any) -> Any:
 
 
 def join_chunks(pieces: Shaped[Array, "K *a S"], N: int) -> Shaped[Array, "N *a"]:
-    """The inverse: (K, ..., CHUNK_SAMPLES) -> (N, ...)."""
+    """The inverse of `split_into_chunks`: (K, ..., CHUNK_SAMPLES) -> (N, ...)."""
     rows = jnp.moveaxis(pieces, -1, 1)
     return rows.reshape(rows.shape[0] * rows.shape[1], *rows.shape[2:])[:N]
 
@@ -171,7 +171,7 @@ def directional(f: Callable[..., Float[Array, "*out"]], primals: Any, tangents: 
 def tangent_recursion(
     A: Float[Array, "N n n"], b: Float[Array, "N n"], dx0: Float[Array, " n"]
 ) -> Float[Array, "N n"]:
-    """`dx[k+1] = A[k] dx[k] + b[k]`: row 0 is `dx0`; A as `state_jacobians` gives it."""
+    """`dx[k+1] = A[k] dx[k] + b[k]`: row 0 is `dx0`; `A` is from `state_jacobians`."""
 
     def body(dx: jax.Array, ab: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         a, force = ab

@@ -1,14 +1,15 @@
-"""Sensitivities of a run: forward mode along with the run, and along effects that are inactive.
+"""Sensitivities of a run: in forward mode along with the run, and to effects that are inactive.
 
     x[k+1] = f(x[k], v[k], c),   dx[k+1] = df/dx dx[k] + df/dv dv[k] + df/dc dc
 
-State and tangents advance together and nothing of the length of the run is stored but what is asked for. The
-D directions are the last axis, so that vector units work on all at once. The state is repeated along that
-axis, so that one expression serves both; what is the same in all directions is computed once (`repetition`).
+State and tangents advance together, and the requested result is the only array of the length of the run. The
+D directions are the last axis, so that vector units work on all directions at once. The state is repeated
+along that axis, so that one expression serves state and tangents; whatever is the same in all directions is
+computed once (`repetition`).
 `scan.states` stores the Jacobians of the step instead, for reverse mode and for inactive effects.
 
-An effect whose amplitude is zero leaves the run and its Jacobians `A[k]` as they are without it. It only adds
-a forcing `b[k]` to the same recursion,
+An effect whose amplitude is zero does not change the run and its Jacobians `A[k]`. It only adds a forcing
+`b[k]` to the same recursion,
 
     dx[k+1] = A[k] dx[k] + b[k],
 
@@ -46,8 +47,8 @@ class RunParameters(NamedTuple):
     Attributes:
         values: Parameter values.
         gates: One factor per effect.
-        x0: First state, or that of each window.
-        K: Gain; None for a free run.
+        x0: First state, or the first state of each window.
+        K: Kalman gain; None for a free run.
     """
 
     values: Float[Array, "*batch P"]
@@ -64,8 +65,8 @@ class RecordingSamples(NamedTuple):
         y: Measured outputs.
         seen: One where a sample may correct the state, zero where it may not.
         Ts: Sampling period [s].
-        window: Window of each sample, where the run starts again at each; None for one run.
-        count: Samples that are run, where it is not all of them.
+        window: Index of the window of each sample, if the run starts again at each window; else None.
+        count: Number of samples that are run; None for all.
     """
 
     u: Float[Array, "*batch N"]
@@ -85,7 +86,7 @@ class RecordingSamples(NamedTuple):
 
 
 class LinearisedRun(NamedTuple):
-    """A run, and how each of its steps answers to a change of the state before it.
+    """A run, and the derivative of each of its steps with respect to the state before the step.
 
     Attributes:
         X: States.
@@ -109,17 +110,17 @@ def inactive_sensitivities(
 ) -> Float[Array, "D N C"]:
     """Derivatives of the predicted outputs along effects that are inactive.
 
-    What no inactive effect enters (the matrices of the step, say, if none of them is linear) has no
-    derivative in the program either.
+    The program differentiates only what an inactive effect enters. If none of them is linear, for instance,
+    the matrices of the step are not differentiated.
 
     Args:
-        structure: With all effects; static.
+        structure: Structure with all effects; static.
         solver: Integration rule; static.
         inactive: Indices of the effects that the directions move; static.
-        parameters: Every inactive effect at zero amplitude, or with its gate closed.
+        parameters: Parameters, with every inactive effect at zero amplitude or with its gate at zero.
         samples: The recording.
-        active: Places of the states that do not belong to inactive effects.
-        run: Without the inactive effects, from `inactive_laws.run_responses`.
+        active: Indices of the states that do not belong to inactive effects.
+        run: Run without the inactive effects, from `inactive_laws.run_responses`.
         dvalues: Directions in the parameter values.
         dgates: Directions in the gates.
     """
@@ -138,7 +139,7 @@ def inactive_sensitivities(
         return solver.prepare(structure, values, gates, samples.Ts)
 
     def with_derivatives(f: Callable[[Array, Array], Any], moves: bool) -> tuple[Any, Any]:
-        """A value, and its derivative along each direction; None where it has none."""
+        """The value of `f`, and its derivative along each direction; None if it does not depend on them."""
         at = parameters.values, parameters.gates
         if not moves:
             return f(*at), None
@@ -150,7 +151,7 @@ def inactive_sensitivities(
     X = run.X
     if X.shape[1] < len(x0):  # with the inactive effects' own states, driven by the run
         X = states(step, x0, (v, *measured), (c, parameters.K))
-    # One by one, so that numbers of other effects have no derivative.
+    # As single numbers, so that parameters of other effects are not differentiated.
     scalars = list(jnp.unstack(parameters.values))
     inputs, constants = (v, *measured), (c._replace(values=scalars), parameters.K)
 
@@ -170,16 +171,16 @@ def inactive_sensitivities(
 
 
 Accumulator = Callable[[Any, Float[Array, " C"], Float[Array, "C D"], Any], tuple[Any, Any]]
-"""`accumulate(sums, y_hat, J, (y, seen))` to new sums and what is stored."""
+"""`accumulate(sums, y_hat, J, (y, seen))` returns the new sums and what is stored of this sample."""
 
 
 class TangentDirections(NamedTuple):
     """Directions in which a run is differentiated.
 
     Attributes:
-        values: In the parameter values.
-        gates: In the gates.
-        x0: In the first state, the same in every window.
+        values: Components in the parameter values.
+        gates: Components in the gates.
+        x0: Components in the first state, the same in every window.
     """
 
     values: Float[Array, "*batch D P"]
@@ -199,19 +200,19 @@ def accumulate_outputs(
     """Sums over the outputs of a run and their derivatives, sample by sample.
 
     Forward mode only. Not for a prediction in hundreds of directions, which no longer fit into the
-    processor's first cache.
+    processor's first-level cache.
 
     Args:
         structure: Mechanism without parameter values; static.
         solver: Integration rule; static.
-        parameters: Where it runs; a free run where the gain is None.
-        directions: Of the derivatives.
+        parameters: Parameters of the run; a free run if the gain is None.
+        directions: Directions of the derivatives.
         samples: The recording.
         accumulate: What to do with the outputs of a sample.
         start: Sums before the first sample.
 
     Returns:
-        The last sums, and what was stored (N, ...), nothing where the samples have a count.
+        The last sums, and what was stored (N, ...); None instead if the samples have a count.
     """
     values, gates, x0, K = parameters
     D = len(directions.x0)
@@ -241,7 +242,7 @@ def accumulate_outputs(
         return predictor(x, (v, *sample), (c, K))
 
     def along(at: Any, tangents: Any) -> tuple[Array, Array]:
-        """The state after a step and its derivative in one direction, or in all where all are repeated."""
+        """The state after a step, and its derivative in one direction, or in all if `at` is repeated."""
         v, x, c, *given = at
         if tangents[0] is None:  # the voltage has no derivative
             return jax.jvp(lambda x, c: step(v, x, c, *given), (x, c), tangents[1:])
@@ -293,7 +294,7 @@ def outputs_with_sensitivities(
 ) -> tuple[Float[Array, "N C"], Float[Array, "N C D"]]:
     """Outputs of a run and their derivatives along some directions; arguments as in `accumulate_outputs`.
 
-    Forward mode only, and several times quicker than `jax.jacfwd` of a run.
+    Forward mode only, and several times faster than `jax.jacfwd` of a run.
     """
     store: Accumulator = lambda sums, y, J, _: (sums, (y, J))  # noqa: E731
     return accumulate_outputs(structure, solver, parameters, directions, samples, store, ())[1]

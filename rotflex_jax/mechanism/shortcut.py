@@ -1,4 +1,4 @@
-"""Quick ways through a step, taken where they lead to the same result as the general one."""
+"""Faster computations of a step, used where they give the same result as the general computation."""
 
 import contextlib
 import threading
@@ -20,13 +20,14 @@ Way = Callable[[], Shaped[Array, "n *S"]]
 
 
 def shortcut(quick: Callable[[], tuple[Bool[Array, "*S"], Way]], general: Way) -> Shaped[Array, "n *S"]:
-    """What a quick way gives if it suffices for all that is computed side by side, else the general way.
+    """The result of a quick computation if it is right for all states side by side, else of the general one.
 
-    Only the chosen one is computed, under `jax.vmap` as well.
+    Only the chosen computation is carried out, also under `jax.vmap`.
 
     Args:
-        quick: Gives where the quick way leads to the result of the general one, and that way.
-        general: The general way; right wherever the result is used.
+        quick: Returns where the quick computation gives the result of the general one, and the quick
+            computation itself.
+        general: The general computation; right wherever its result is used.
     """
     if not _tracing.shortcuts:
         return general()
@@ -36,9 +37,9 @@ def shortcut(quick: Callable[[], tuple[Bool[Array, "*S"], Way]], general: Way) -
 
 @contextlib.contextmanager
 def without_shortcuts() -> Iterator[None]:
-    """Steps that are traced in here go the general way.
+    """Within this context, steps are traced with the general computation.
 
-    For a reader of what is evaluated in a step, who needs one way through it.
+    For code that records the evaluations within a step, and therefore needs a single sequence of them.
     """
     before, _tracing.shortcuts = _tracing.shortcuts, False
     try:
@@ -49,7 +50,7 @@ def without_shortcuts() -> Iterator[None]:
 
 @jax.custom_batching.custom_vmap
 def _everywhere(suffices: Bool[Array, ""]) -> Bool[Array, ""]:
-    """The same, for all of a batch: a choice for each of its members would compute both ways for all."""
+    """The argument, combined over a batch: a choice for each member would compute both branches for all."""
     return suffices
 
 

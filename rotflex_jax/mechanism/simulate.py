@@ -40,7 +40,7 @@ def sensor_readings(
     true: Float[Array, "C *S"],
     x: Float[Array, "n *S"] | None,
 ) -> Float[Array, "C *S"]:
-    """Sensor readings of true outputs; of the states `x`, which only sensors with dynamics need."""
+    """Sensor readings for true outputs; only sensors with dynamics need the states `x`."""
     found = effects_of(mechanism, Sensing)
     if not found:
         return true
@@ -67,7 +67,7 @@ def sensor_readings(
 def read_outputs(
     mechanism: Mechanism, gates: Float[Array, "E *D"], x: Float[Array, "n *S"]
 ) -> Float[Array, "C *S"]:
-    """Sensor readings of states."""
+    """Sensor readings for given states."""
     return sensor_readings(mechanism, gates, true_outputs(mechanism.structure, x), x)
 
 
@@ -91,7 +91,7 @@ Solver = Exponential | SmoothRK4
 
 @dataclasses.dataclass(frozen=True)
 class FreeStep:
-    """State to state under the recorded voltage."""
+    """One step of a free run: from one state to the next under the recorded voltage."""
 
     structure: Mechanism
     solver: Solver
@@ -108,9 +108,9 @@ class FreeStep:
 
 @dataclasses.dataclass(frozen=True)
 class PredictorStep:
-    """State to state, corrected by the measured output first: `x+ = F(x + K (y - h(x)), v)`.
+    """One step of a predictor, which first corrects the state: `x+ = F(x + K (y - h(x)), v)`.
 
-    Where the next sample begins a window of its own, the state there is the first state of that window.
+    Where the next sample begins a window, the next state is the first state of that window.
     """
 
     structure: Mechanism
@@ -123,9 +123,9 @@ class PredictorStep:
 
         Args:
             x: State.
-            w: Voltage, outputs, whether they may correct the state; and where a run has windows, whether one
-                ends here and the first state of the next one.
-            constants: Of the solver, and the gain.
+            w: Voltage, outputs, and whether the outputs may correct the state; for a run with windows also
+                whether a window ends here, and the first state of the next window.
+            constants: Constants of the solver, and the gain.
         """
         v, y, seen, *restart = w
         c, K = constants
@@ -136,7 +136,7 @@ class PredictorStep:
 
 
 def started_again(x: Float[Array, "n *S"], restart: Sequence[Float[Array, "..."]]) -> Float[Array, "n *S"]:
-    """The state, or the first state of the next window where one ends; `restart` as `restarts` gives it."""
+    """The state, or the first state of the next window where a window ends; `restart` is from `restarts`."""
     if not restart:
         return x
     ends, start = restart
@@ -146,7 +146,7 @@ def started_again(x: Float[Array, "n *S"], restart: Sequence[Float[Array, "..."]
 def restarts(
     x0: Float[Array, "W n"], window: Integer[Array, " N"]
 ) -> tuple[Float[Array, " n"], tuple[Float[Array, " N"], Float[Array, "N n"]]]:
-    """The first state of a run that starts again at each window, and what its step needs at each sample.
+    """The first state of a run that starts again at each window, and the restart inputs of its steps.
 
     Args:
         x0: First states of the windows.
@@ -185,7 +185,7 @@ def free_run(
         structure: `mechanism.structure`; static.
         solver: Integration rule; static.
         values: Parameter values.
-        gates: One factor per effect, 1 where it is on.
+        gates: One factor per effect, 1 if the effect is on.
         x0: First state.
         u: Voltage [V], held over each sample, and the signals of the mechanism beside it.
         Ts: Sampling period [s].
@@ -221,7 +221,8 @@ def predictor_run(
         seen: One where a sample may correct the state, zero where it may not.
         K: Gain; zero for a free run.
         Ts: Sampling period [s].
-        window: Window of each sample, where the run starts again at each; `x0` is then (W, n).
+        window: Index of the window of each sample, if the run starts again at each window; `x0` is then
+            (W, n).
     """
     mechanism, v, c = prepared_run(structure, solver, values, gates, u, Ts)
     x0, restart = (x0, ()) if window is None else restarts(x0, window)
@@ -243,9 +244,9 @@ def first_predictions(
     window: Integer[Array, " N"],
     count: Integer[Array, ""],
 ) -> Float[Array, "N C"]:
-    """The first `count` outputs that `predictor_run` predicts, zeros after them; not to be differentiated.
+    """The first `count` outputs that `predictor_run` predicts, then zeros; not to be differentiated.
 
-    One program predicts runs of any length up to N.
+    One compiled program serves runs of any length up to N.
     """
     mechanism, v, c = prepared_run(structure, solver, values, gates, u, Ts)
     first, restart = restarts(x0, window)
@@ -283,10 +284,10 @@ def _free_outputs(structure, solver, values, gates, x0, u, Ts):  # noqa: ANN001,
 def first_state(
     rest: Float[np.ndarray, " n"], x0: Real[ArrayLike, " m"] | Sequence[float] | None
 ) -> Float[np.ndarray, " n"]:
-    """The state at rest with the first entries that are known.
+    """The first state: the entries of `x0`, then the state at rest.
 
     Raises:
-        InputError: More entries than states, or what is no list of finite numbers.
+        InputError: `x0` has more entries than the model has states, or is no list of finite numbers.
     """
     start = rest.copy()
     if x0 is None:
@@ -312,14 +313,14 @@ def simulate(
 
     Args:
         mechanism: Model.
-        u: Voltage [V] (N,), held over each sample; (N, 1 + S) with the signals that drive the mechanism
-            beside it, in the order of `mechanism.signals`.
+        u: Voltage [V] (N,), held over each sample; (N, 1 + S) if signals drive the mechanism too, in the
+            order of `mechanism.signals`.
         Ts: Sampling period [s].
         x0: First state, or only its positions and speeds.
         solver: Integration rule; `Exponential()` if None.
 
     Raises:
-        InputError: A coordinate without inertia, no signal of finite numbers, a period that is not positive.
+        InputError: A coordinate has no inertia, `u` is no signal of finite numbers, or `Ts` is not positive.
     """
     return _simulated(_free_outputs, mechanism, u, Ts, x0, solver)
 
@@ -352,7 +353,7 @@ def _simulated(run, mechanism, u, Ts, x0, solver):  # noqa: ANN001, ANN202 - typ
 
 
 def _input(mechanism: Mechanism, u: Any) -> Float[np.ndarray, "N *c"]:
-    """The voltage, with the signals beside it where the mechanism takes them; checked."""
+    """The voltage, with the signals beside it if the mechanism takes signals; checked."""
     names = mechanism.signals
     if not names:
         return signal(u)

@@ -1,7 +1,8 @@
 """Products of small matrices with states, written out so that the compiler fuses them into the loop.
 
-States may stand side by side: (m, ...). Then each may have a matrix of its own, which is how a run carries
-its sensitivities along many directions (`sensitivities`): the directions come last, for the vector units.
+Several states may be given side by side: (m, ...). Each may then have a matrix of its own. A run uses this to
+carry its sensitivities along many directions (`sensitivities`); the directions come last, for the vector
+units.
 """
 
 import functools
@@ -18,7 +19,7 @@ from rotflex_jax.effects.base import Effect
 
 
 def matvec(A: Shaped[Array, "n m *D"], x: Shaped[Array, "m *S"]) -> Shaped[Array, "n *S"]:
-    """`A @ x`; A has no axes beyond the second, or those of x."""
+    """`A @ x`; beyond its first two axes A has no further axes, or the further axes of x."""
     if A.ndim == 2 or not A.shape[1]:
         return jnp.sum(expand_axes(A, x[None]) * x[None], axis=1)
     # Each direction with a matrix of its own: column by column, which runs three times faster.
@@ -37,7 +38,7 @@ def scaled_vector(a: Shaped[Array, "n *D"], v: Shaped[Array, "*S"]) -> Shaped[Ar
 
 
 def sparse_matvec(rows: tuple[tuple[float, ...], ...], x: Shaped[Array, "m *S"]) -> Shaped[Array, "k *S"]:
-    """`rows @ x` for constant coefficients, most of them zero or one, which cost nothing."""
+    """`rows @ x` for constant coefficients; coefficients that are zero or one cost nothing."""
     zero, found, each = jnp.zeros(x.shape[1:], x.dtype), [], jnp.unstack(x)
     for row in rows:
         terms = [each[j] if c == 1 else c * each[j] for j, c in enumerate(row) if c]
@@ -46,10 +47,10 @@ def sparse_matvec(rows: tuple[tuple[float, ...], ...], x: Shaped[Array, "m *S"])
 
 
 def with_rows(x: Shaped[Array, "n *S"], rows: Mapping[int, Shaped[Array, "*S"]]) -> Shaped[Array, "n *S"]:
-    """The same states with other rows.
+    """The same states with some rows replaced.
 
-    Chosen entry by entry: rows set or put together are branches in the compiled loop over the entries, and
-    vector units take none.
+    The rows are selected entry by entry: setting or stacking rows would put branches into the compiled loop
+    over the entries, which vector units cannot execute.
     """
     place = expand_axes(jnp.arange(len(x)), x)
     for k, row in rows.items():
@@ -58,16 +59,17 @@ def with_rows(x: Shaped[Array, "n *S"], rows: Mapping[int, Shaped[Array, "*S"]])
 
 
 def computed_once(a: Shaped[Array, "*S"]) -> Shaped[Array, "*S"]:
-    """The same array, which the compiler stores: what is cheap it would compute again for each use of it.
+    """The same array, stored by the compiler, which would otherwise recompute a cheap array for each use.
 
-    A reduction to the precision that the array has is what it neither removes nor repeats.
+    A reduction to the precision that the array already has is an operation that the compiler neither removes
+    nor repeats.
     """
     kept = jnp.finfo(a.dtype)
     return jax.lax.reduce_precision(a, kept.nexp, kept.nmant)
 
 
 def evaluate_effect(e: Effect, function: Callable[..., Any], *signals: Shaped[Array, "*S"]) -> Any:
-    """`function(effect, *signals)`; for each state separately where each has parameter values of its own."""
+    """`function(effect, *signals)`; for each state separately if each has its own parameter values."""
     values = e.values
     if all(np.ndim(value) == 0 for value in values.values() if value is not None):
         return function(e, *signals)

@@ -36,8 +36,8 @@ class SmoothConstants(NamedTuple):
         values: Parameter values.
         gates: One factor per effect.
         h: Length of a step [s].
-        equations: Of the linear part.
-        load: Rows of the transmitted torques; None where no friction depends on them.
+        equations: Equations of motion of the linear part.
+        load: Rows of the transmitted torques; None if no friction depends on them.
     """
 
     values: Real[Array, " P"]
@@ -51,7 +51,7 @@ class SmoothConstants(NamedTuple):
 class SmoothRK4:
     """Classical Runge-Kutta of order 4 with friction `level * tanh(speed / width)`.
 
-    Stable while `h < 2.5 J width / level` and while h is short against the fastest linear mode.
+    Stable while `h < 2.5 J width / level` and while h is short compared with the fastest linear mode.
 
     Attributes:
         width: Speed over which friction changes sign [rad/s].
@@ -88,7 +88,7 @@ class SmoothRK4:
     def advance(
         self, structure: Mechanism, x: Float[Array, "n *S"], v: Float[Array, "*cS"], c: SmoothConstants
     ) -> Float[Array, "n *S"]:
-        """State one sample later under the held voltage `v` [V], which signals follow as in `Exponential`."""
+        """State one sample later under the held voltage `v` [V]; signals follow it as in `Exponential`."""
         mechanism = structure.with_values(c.values)
 
         def step(_: Any, s: Array) -> Array:

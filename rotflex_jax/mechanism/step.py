@@ -42,12 +42,12 @@ from rotflex_jax.mechanism.small_matrices import (
     with_rows,
 )
 
-# A memory that grows by itself does so by no more than so many e-folds in a step: its state stays finite.
+# Largest growth of an unstable memory within one step, in e-folds; it keeps the state finite.
 MOST_GROWTH = 30.0
 
 
 def port_motion(layout: Layout, x: Float[Array, "m *S"]) -> tuple[Float[Array, "p *S"], Float[Array, "p *S"]]:
-    """Positions and speeds of the torque ports at linear states."""
+    """Positions and speeds of the torque ports for given linear states."""
     P, n = layout.port_matrix, layout.n
     speeds = tuple((0.0,) * n + row for row in P)
     position, speed = jnp.split(sparse_matvec(P + speeds, x), 2)
@@ -58,7 +58,7 @@ def port_motion(layout: Layout, x: Float[Array, "m *S"]) -> tuple[Float[Array, "
 
 
 def voltage_of(mechanism: Mechanism, v: Float[Array, "*cS"]) -> Float[Array, "*S"]:
-    """The voltage in what drives a step, which the signals follow where the mechanism takes them."""
+    """The voltage among the inputs of a step; the signals follow it if the mechanism takes signals."""
     return v[0] if mechanism.takes_signals else v
 
 
@@ -72,7 +72,7 @@ def motor_torque(
     """Torque [N m] of the linear motors at a port for the linear state `x` and the voltage `v`.
 
     The current takes its steady value: it follows every new voltage within a fraction of the step, so its
-    values at the ends of a step say nothing about its mean.
+    values at the ends of a step do not determine its mean.
     """
     layout = Layout.of(mechanism.structure)
     port = (mechanism.port_vectors[at],)
@@ -96,14 +96,14 @@ def motor_torque(
 
 
 class LoadRows(NamedTuple):
-    """The torque that the motors transmit through each friction port, as a sum over what makes it up.
+    """The torque that each friction port transmits, as a linear combination of its sources.
 
     Attributes:
         state: Coefficients of the linear states.
         voltage: Coefficients of the voltage.
         torques: Coefficients of the torques of forces and memories at the torque ports.
-        motors: One where those of the motors at the port itself count as the motors', zero where no friction
-            depends on the torque.
+        motors: Coefficient of the motors' torque beyond its linear part: one, or zero at a port where no
+            friction depends on the transmitted torque.
     """
 
     state: Float[Array, "k m *D"]
@@ -117,13 +117,14 @@ def load_rows(mechanism: Mechanism, gates: Float[Array, " E"]) -> LoadRows | Non
 
         load = (1 - s) motor - s rest,   rest = inertia p.ddq - motor
 
-    The inertia that is entered at the port lies between both sides. It accelerates by all torques but dry
-    friction, which is what the load determines. With `motor = a + f` and `inertia p.ddq = b + g`, where a and
-    b are linear and f and g are those of forces and memories, the load is `a - s b + f - s g`; the share s of
-    the rest is a half, unless the friction says otherwise.
+    Here `motor` is the torque of the motors at the port and `rest` the torque of the rest of the machine. The
+    inertia at the port lies between the two. Its acceleration includes all torques except dry friction,
+    because the load determines the dry friction. With `motor = a + f` and `inertia p.ddq = b + g`, where a
+    and b are linear in state and voltage and f and g come from forces and memories, the load is
+    `a - s b + f - s g`. The share s is `rest_share` of the friction, by default a half.
 
     Args:
-        mechanism: With (traced) parameter values.
+        mechanism: Mechanism with (traced) parameter values.
         gates: One factor per effect.
     """
     layout = Layout.of(mechanism.structure)
@@ -145,7 +146,7 @@ def load_rows(mechanism: Mechanism, gates: Float[Array, " E"]) -> LoadRows | Non
         position, speed = sparse_matvec(vector, x[:n])[0], sparse_matvec(vector, x[n : 2 * n])[0]
         here = [(i, e.stamp(), e) for i, e in effects_of(mechanism, Linear) if e.at == port]
         inertia = sum(gates[i] * stamp.inertia for i, stamp, _ in here)
-        # What the current gives now is what accelerates; what it gives over a step is its steady value.
+        # The present current accelerates the inertia; over a step the current has its steady value.
         own = own_states(mechanism)
         now = jnp.zeros(m + 1, gates.dtype)
         for i, stamp, e in here:
@@ -171,13 +172,13 @@ def transmitted_torques(
     v: Float[Array, "*cS"],
     gates: Float[Array, "E *D"],
 ) -> Float[Array, "k *S"] | None:
-    """Torques [N m] through the friction ports; None where none is asked for.
+    """Torques [N m] that the friction ports transmit; None if no friction depends on them.
 
     Args:
-        mechanism: With (traced) parameter values.
+        mechanism: Mechanism with (traced) parameter values.
         rows: From `load_rows`.
-        x: State, of which the linear part is read.
-        z: Memories.
+        x: State, of which only the linear part is read.
+        z: States of the memories.
         v: Voltage [V], and signals.
         gates: One factor per effect.
     """
@@ -203,14 +204,14 @@ def friction_level(
     direction: float,
     load: Float[Array, "*S"] | None,
 ) -> Scalar:
-    """Level [N m] of a dry friction against motion in a direction; one number where it is the same anywhere.
+    """Level [N m] of a dry friction against motion in a direction; a single number if it is constant.
 
     Args:
         e: The effect.
-        position: Of its port.
-        speed: Size of its speed.
+        position: Position of its port.
+        speed: Absolute value of the speed of its port.
         direction: +1 or -1.
-        load: Torque through the port [N m].
+        load: Torque that the port transmits [N m].
     """
     signals = (position, speed) if load is None or not e.loaded else (position, speed, load)
     limit = lambda e, q, s, *load: e.limit(q, s, direction, *load)  # noqa: E731
@@ -238,7 +239,7 @@ def _loops(mechanism: Mechanism, at: str) -> list[tuple[int, Force | Memory]]:
 def _driven_by_motor(
     mechanism: Mechanism, at: str, kind: type[Force] | type[Memory]
 ) -> list[tuple[int, Force | Memory]]:
-    """Laws of a kind at a port that take from the torque of its motors, with their indices."""
+    """Effects of a kind at a port that are driven by the torque of its motors, with their indices."""
     return [(i, e) for i, e in effects_of(mechanism, kind) if e.driven_by == "motor" and e.at == at]
 
 
@@ -251,7 +252,7 @@ def _of_laws(
     v: Float[Array, "*S"],
     gates: Float[Array, "E *D"],
 ) -> Float[Array, "*S"]:
-    """Torque [N m] of some laws at a port, each with its index among the effects."""
+    """Sum of the torques [N m] of some effects at a port; `laws` has each with its index."""
     layout = Layout.of(mechanism.structure)
     position, speed = port_motion(layout, x)
     total = jnp.zeros(x.shape[1:], x.dtype)
@@ -286,7 +287,7 @@ def motor_duty(
 
 
 def _force(e: Force | Memory, *signals: Float[Array, "*S"]) -> Float[Array, "*S"]:
-    """Torque of a force or a memory; signals as its `force` takes them."""
+    """Torque of a force or a memory; `signals` are the arguments of its method `force`."""
     return evaluate_effect(e, lambda e, *given: e.force(*given), *signals)
 
 
@@ -298,13 +299,13 @@ def motor_correction(
     v: Float[Array, "*S"],
     gates: Float[Array, "E *D"],
 ) -> Float[Array, "*S"]:
-    """Torque [N m] of the motors at a port beyond their linear part: less for a limit, heat or saturation."""
+    """Torque [N m] of the motors at a port beyond their linear part: limits, heat and saturation."""
     laws = (*_of_current(mechanism, at), *_driven_by_motor(mechanism, at, Force))
     return _of_laws(mechanism, laws, at, x, z, v, gates)
 
 
 def _of_current(mechanism: Mechanism, at: str) -> tuple[tuple[int, Force | Memory], ...]:
-    """Laws of the motors at a port that change their current: limits and heat, saturation does not."""
+    """Effects on the motors at a port that change their current: limits and heat, but not saturation."""
     return (*_loops(mechanism, at), *_driven_by_motor(mechanism, at, Memory))
 
 
@@ -316,7 +317,7 @@ def drive_of(
     v: Float[Array, "*S"],
     gates: Float[Array, "E *D"],
 ) -> Float[Array, "*S"]:
-    """Last argument of `flow` and `force`, as `driven_by` of the effect says."""
+    """Last argument of `flow` and `force` of an effect: the quantity that its `driven_by` names."""
     if e.driven_by == "voltage":
         return v
     if e.driven_by == "duty":
@@ -332,7 +333,7 @@ def drive_of(
 
 
 def has_smooth_torques(mechanism: Mechanism) -> bool:
-    """Whether `torques` of a mechanism may be other than zero."""
+    """Whether `torques` of a mechanism may differ from zero."""
     return any(e.torque_at_port and not e.dry_contact for e in mechanism.effects)
 
 
@@ -346,10 +347,10 @@ def torques(
     """Torques of forces and memories at the torque ports.
 
     Args:
-        mechanism: With (traced) parameter values.
-        x: State, of which the linear part is read.
-        z: Memories.
-        v: Voltage [V]; with the signals (1 + S, *S) where effects of the mechanism take them.
+        mechanism: Mechanism with (traced) parameter values.
+        x: State, of which only the linear part is read.
+        z: States of the memories.
+        v: Voltage [V]; with the signals (1 + S, *S) if effects of the mechanism take signals.
         gates: One factor per effect.
     """
     layout = Layout.of(mechanism.structure)
@@ -382,9 +383,10 @@ def memory_rates(
     gates: Float[Array, "E *D"],
     others: Float[Array, "z *S"] | None = None,
 ) -> Float[Array, "z *S"]:
-    """Time derivatives of the memories; arguments as for `torques`.
+    """Time derivatives of the states of memories; arguments as for `torques`.
 
-    `others` are the memories as the motor has them, which drive further ones; `z` if None.
+    `others` are the states from which the motor's torque or duty is computed, where these drive a memory;
+    `z` if None.
     """
     others = z if others is None else others
     layout = Layout.of(mechanism.structure)
@@ -405,10 +407,13 @@ def advance_memories(
     gates: Float[Array, "E *D"],
     h: Float[Array, "*D"],
 ) -> Float[Array, "z *S"]:
-    """Memories after `h` [s], motion held at `x`: exponential Rosenbrock-Euler, stable when stiff."""
+    """States of the memories after `h` [s], with the motion held at `x`: exponential Rosenbrock-Euler.
+
+    The rule is stable for stiff memories.
+    """
     if not z.shape[0]:
         return z
-    # What drives a flow is held, other states of memories too.
+    # The drive of each flow is held, and with it the states of other memories.
     after = exponential_euler(lambda s: memory_rates(mechanism, x, s, v, gates, z), z, h)
     limits = np.array([e.limits for _, e in effects_of(mechanism, Memory)])
     if not np.isfinite(limits).any():
@@ -421,11 +426,11 @@ def exponential_euler(
     z: Float[Array, "z *S"],
     h: Float[Array, "*D"],
 ) -> Float[Array, "z *S"]:
-    """States after `h` [s], each with a flow that depends on no other one.
+    """States after `h` [s], where the flow of each state depends on no other state.
 
-    A state that grows by itself does so by no more than `MOST_GROWTH` e-folds in a step.
+    The growth of an unstable state is limited to `MOST_GROWTH` e-folds in a step.
     """
-    # So one direction gives all derivatives.
+    # The flows are independent, so one direction gives all derivatives.
     rate, slope = jax.jvp(flow, (z,), (jnp.ones_like(z),))
     h = expand_axes(h[None], z)
     a = jnp.minimum(slope * h, MOST_GROWTH)
@@ -442,10 +447,11 @@ class Exponential:
         order: 2 or 4, the order of the rule for smooth torques.
         substeps: Steps per sample; compare with a larger number to see the error.
         passes: Passes over coupled friction contacts, see `friction.coupled_contacts`; None solves any case.
-        between: The voltage between its samples: "held", or "smooth" as behind a low-pass filter, which needs
-            about four substeps; "switched" where a delay or a lag changes it within the sample: the motion is
-            then right at the end of this sample, with "held" at the end of the next. For machines without dry
-            friction and play, in one step per sample.
+        between: The voltage between its samples. "held": constant over each sample. "smooth": as behind a
+            low-pass filter; this needs about four substeps. "switched": a delay or a lag changes the voltage
+            within the sample; the motion is then correct at the end of the same sample, with "held" only at
+            the end of the next. "switched" is for machines without dry friction and play, and takes one step
+            per sample.
     """
 
     order: int = 2
@@ -493,8 +499,9 @@ class Exponential:
         Args:
             structure: The mechanism without parameter values.
             x: State.
-            v: Voltage held over the sample (*S) [V], over each substep (substeps, *S), or its mean and first
-                moment (2, *S); signals follow where the mechanism takes them; from `assembly.motor_inputs`.
+            v: From `assembly.motor_inputs`: voltage [V] held over the sample (*S), voltage over each substep
+                (substeps, *S), or mean and first moment of the voltage (2, *S); then the signals, if the
+                mechanism takes signals.
             c: From `prepare`.
         """
         mechanism = structure.with_values(c.values)
@@ -533,7 +540,7 @@ def _advance_smooth(
     solver: Exponential,
     extra: Array | None = None,
 ) -> Array:
-    """The step under one set of equations; `extra`, zero for memories, is added to the state at its end."""
+    """A step with one set of equations; `extra`, zero for memories, is added to the state at its end."""
     layout = Layout.of(mechanism.structure)
     z = x[layout.linear :]
     voltage = voltage_of(mechanism, v)
@@ -558,7 +565,7 @@ def _advance_smooth(
 
 
 def _with_rows_of_memories(c: Constants, number: int) -> Constants:
-    """Constants whose responses are those of the whole state: zero for its memories."""
+    """Constants with responses of the whole state: zero for the states of memories."""
     if not number:
         return c
     names = ("E", "input", "hold", "ramp", "rise", "push", "half_E", "half_input", "half_hold", "tilt")
@@ -568,7 +575,7 @@ def _with_rows_of_memories(c: Constants, number: int) -> Constants:
 
 
 def _fourth_order(mechanism, x, z, z1, v, f0, brake, end, c):  # noqa: ANN001, ANN202 - as in `_advance_smooth`
-    """Correction of the state for torques that change from `f0`, ETDRK4; `end` is the state without it."""
+    """Correction of the state for torques that change from `f0` (ETDRK4); `end` is the state without it."""
     held = (lambda f: f) if brake is None else lambda f: f + brake
     voltage = voltage_of(mechanism, v)
     half = matvec(c.half_E, x[: c.half_E.shape[1]]) + scaled_vector(c.half_input, voltage)
@@ -607,7 +614,7 @@ def _friction_levels(
 def _predicted_friction(
     mechanism: Mechanism, x: Array, end: Array, z: Array, v: Array, c: Constants
 ) -> Array:
-    """Friction torques for the stages: exact where a port slides, contacts uncoupled."""
+    """Friction torques for the stages of the rule: exact for sliding ports, contacts taken as uncoupled."""
     layout = Layout.of(mechanism.structure)
     k = layout.contacts
     up, down = _friction_levels(mechanism, x, end, z, v, c)
@@ -621,7 +628,7 @@ def _predicted_friction(
 def _with_dry_friction(
     mechanism: Mechanism, x: Array, end: Array, z: Array, v: Array, c: Constants, passes: int | None
 ) -> Array:
-    """The state at the end of the step with dry friction, positions matched to the stop inside it."""
+    """The state at the end of the step with dry friction, with positions corrected for stops within it."""
     layout = Layout.of(mechanism.structure)
     k = layout.contacts
     if not k:
@@ -632,7 +639,7 @@ def _with_dry_friction(
     levels = _friction_levels(mechanism, x, end, z, v, c)
 
     def levels_after(torque: Array) -> tuple[Array, Array]:
-        """Levels that belong to the speed that friction leaves, not to the one without it."""
+        """Levels at the speed with this friction torque, not at the speed without friction."""
         return _friction_levels(mechanism, x, end + matvec(c.hold[:, :k], torque), z, v, c)
 
     def any_case() -> Array:
@@ -643,7 +650,7 @@ def _with_dry_friction(
         return _stopped(layout, c, end + matvec(c.hold[:, :k], found.torque), q0, v0, found, final)
 
     def sliding() -> tuple[Array, Callable[[], Array]]:
-        """Most steps pass no stop, and what follows one costs more than the rest of the step."""
+        """Most steps pass no stop, and the correction for a stop costs more than the rest of the step."""
         final, slides = levels, all_slide(v0, free, stop, *levels)
         if not steady:
             final = levels_after(sliding_torques(v0, *levels))
@@ -663,7 +670,7 @@ def _stopped(
     found: Contact,
     levels: tuple[Array, Array],
 ) -> Array:
-    """The state at the end of a step in which contacts may stop, positions matched to the stop inside it."""
+    """The state at the end of a step in which contacts may stop, with positions corrected for the stops."""
     k = layout.contacts
     q1, v1 = (m[:k] for m in port_motion(layout, end))
     # A constant torque changes the speed linearly from v0 to v1; in truth it reaches zero after t h. A port

@@ -23,21 +23,21 @@ def compare_plot(
     labels: Sequence[str] | None = None,
     seconds: float | None = None,
 ) -> "Figure":
-    """Measured against simulated outputs, with errors and the fit in per cent; a notebook shows it by itself.
+    """Figure of measured and simulated outputs, with errors and the fit in per cent; a notebook displays it.
 
         fit = 100 (1 - norm(e) / norm(y - mean(y))),    e = y - y_hat
 
     Args:
-        recording: What was measured; its input drives the models.
-        models: Fits, results of searches, models or mechanisms, or whatever else has `simulate(recording)`.
-        labels: What they are called; by what each has more than the first unless given.
-        seconds: Runs start again so often [s]; one free run over all of it unless given.
+        recording: Measured data; its input drives the models.
+        models: Fits, results of searches, models, mechanisms, or any object with `simulate(recording)`.
+        labels: Names of the models; by default the effects that each has in addition to the first.
+        seconds: Length of the windows after which free runs start again [s]; a single free run if None.
 
     Returns:
         The figure; its `savefig` writes a file.
 
     Raises:
-        InputError: No recording, no model, or something that does not simulate.
+        InputError: No recording or no model was given, or an object cannot simulate.
     """
     if not isinstance(recording, Recording):
         raise InputError(
@@ -65,10 +65,10 @@ def compare_plot(
 
 
 def simulator(thing: Any) -> Any:
-    """What simulates: the model of a fit or of a search, a mechanism as a model, others as they are.
+    """The object that simulates: the model of a fit or a search, a mechanism as a model, others unchanged.
 
     Raises:
-        InputError: It does not simulate.
+        InputError: The object cannot simulate.
     """
     found = getattr(thing, "model", thing)
     found = Model(found) if isinstance(found, Mechanism) else found
@@ -81,7 +81,7 @@ def simulator(thing: Any) -> Any:
 
 
 def default_labels(simulators: Sequence[Any]) -> tuple[str, ...]:
-    """Names of models: what each has more than the first, else their number.
+    """Names of models: the effects that each has in addition to the first, else a number.
 
     >>> from rotflex_jax.effects import Coulomb
     >>> from rotflex_jax.joints import paper
@@ -104,10 +104,10 @@ def _places(model: Any) -> list[tuple[str, str]]:
 
 
 def shared_channels(simulators: Sequence[Any], recording: Recording) -> tuple[str, ...]:
-    """Channels that all models have, in the order of the first.
+    """Channels that all models have, in the order of the first model.
 
     Raises:
-        InputError: There is none.
+        InputError: The models have no channel in common.
     """
     each = [_channels(m, recording) for m in simulators]
     shared = tuple(c for c in each[0] if all(c in other for other in each))
@@ -127,7 +127,7 @@ def _outputs(
     model: Any, recording: Recording, channels: Sequence[str], seconds: float | None
 ) -> Float[np.ndarray, "N C"]:
     if isinstance(model, Model):
-        model.measured(recording)  # names a channel that the recording lacks
+        model.measured(recording)  # raises an error that names a missing channel
     if seconds is None:
         y = model.simulate(recording)
     elif hasattr(model, "simulate_windows"):

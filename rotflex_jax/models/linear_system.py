@@ -1,4 +1,4 @@
-"""A sampled linear system without any physics in it: what the identified linear models end in."""
+"""A sampled linear black-box system: the common form of the identified linear models."""
 
 import dataclasses
 
@@ -11,7 +11,7 @@ from rotflex_jax.recording.samples import require_period
 
 @dataclasses.dataclass(frozen=True)
 class LinearSystem:
-    """A sampled linear system with an offset and the gain of its own predictor.
+    """A sampled linear system in innovations form, with an offset.
 
         x+ = A x + B [u, 1] + K e,    y = C x + D [u, 1] + e
 
@@ -20,9 +20,9 @@ class LinearSystem:
         B: Columns of the inputs (the input, then the signals) and of the constant.
         C: Output matrix.
         D: Columns of the inputs and of the constant.
-        K: Gain of the prediction error e.
-        Ts: Sampling period it holds for [s].
-        signals: Names of the signals that it takes beside the input.
+        K: Gain of the innovation e.
+        Ts: Sampling period for which the system holds [s].
+        signals: Names of the signals that are inputs too.
     """
 
     A: Float[np.ndarray, "n n"]
@@ -44,16 +44,16 @@ class LinearSystem:
         return np.linalg.eigvals(self.A)
 
     def simulate(self, recording: Recording) -> Float[np.ndarray, "N C"]:
-        """Free run; the first state is the one that follows the first `n_init` samples best.
+        """Free run; the first state is the best fit to the first `n_init` samples.
 
         Raises:
-            InputError: The sampling period is another one, or the recording lacks a signal.
+            InputError: The recording has another sampling period, or lacks a signal.
         """
         with np.errstate(all="ignore"):  # an unstable system overflows
             return self._run(recording, self.start(recording), np.zeros_like(self.K))
 
     def predict(self, recording: Recording) -> Float[np.ndarray, "N C"]:
-        """One step ahead: every sample from all before it; errors as in a free run."""
+        """One-step-ahead prediction of each sample from all samples before it; raises as `simulate` does."""
         with np.errstate(all="ignore"):
             return self._run(recording, self.start(recording), self.K)
 
@@ -67,7 +67,7 @@ class LinearSystem:
         for _ in range(m):
             rows.append(self.C @ power)
             power = self.A @ power
-        # Channels of one size, and no state that hardly shows.
+        # Channels are scaled to one size; `rcond` leaves out state directions that the outputs hardly show.
         size = np.maximum(np.std(recording.y[:m], axis=0), 1e-12 + 1e-3 * np.abs(self.C).max(axis=1))
         O = np.stack(rows) / size[:, None]  # noqa: E741
         y = (recording.y[:m].astype(float) - forced) / size

@@ -1,4 +1,4 @@
-"""A model of a recording: a mechanism with the rule that integrates it."""
+"""A model of a recording: a mechanism with its integration rule."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -45,17 +45,17 @@ MOST_DOUBLED = 16384
 
 
 def program_length(number: int, least: int = 1024) -> int:
-    """A length of arrays that other numbers of samples share, and with it the compiled program.
+    """A length of arrays that several numbers of samples share, and with it the compiled program.
 
-    The next power of two; of more than 16384 one of eight lengths between powers of two, as long runs take
-    longer than what a further program costs.
+    The next power of two; above 16384 the next of eight lengths between two powers of two, because the excess
+    of a long run costs more than one more program.
     """
     step = 1 if number <= MOST_DOUBLED else 2 ** (number.bit_length() - 4)
     return -(-number // step) * step if step > 1 else max(least, 2 ** (number - 1).bit_length())
 
 
 def _filled(u: Float[np.ndarray, "N *c"]) -> Float[np.ndarray, "M *c"]:
-    """An input held beyond its end, up to a length that other recordings share."""
+    """An input whose last value is held, up to a length that several recordings share."""
     return np.pad(u, [(0, program_length(len(u)) - len(u)), *[(0, 0)] * (u.ndim - 1)], "edge")
 
 
@@ -88,7 +88,7 @@ class Model:
         self._check_switched()
 
     def _check_switched(self) -> None:
-        """Refuses voltages that are switched within a sample beside what sticks: it would creep at rest."""
+        """Refuse voltages that switch within a sample for a model that can stick: it would creep at rest."""
         if not isinstance(self.solver, Exponential) or self.solver.between != "switched":
             return
         on = [e for i, e in enumerate(self.mechanism.effects) if self.gates is None or self.gates[i]]
@@ -102,10 +102,10 @@ class Model:
 
     @classmethod
     def of(cls, given: "Mechanism | Model") -> "Model":
-        """A model as it is, and a mechanism as a model with the default rule.
+        """A model unchanged, or a mechanism as a model with the default integration rule.
 
         Raises:
-            InputError: Neither was given.
+            InputError: The argument is neither.
         """
         return given if isinstance(given, Model) else cls(given)
 
@@ -115,14 +115,14 @@ class Model:
         return dataclasses.replace(self, mechanism=self.mechanism + effect, gates=gates)
 
     def save(self, path: str | Path) -> Path:
-        """Write the model as JSON; `Model.load` reads it back bit for bit."""
+        """Write the model as JSON; `Model.load` restores it bit for bit."""
         from rotflex_jax.models.model_json import Saved, save  # imported on request: it needs this module
 
         return save(Saved(self), path)
 
     @classmethod
     def load(cls, path: str | Path) -> "Model":
-        """The model in a file that `save` of a model, a fit or a discovery has written."""
+        """The model in a file that was written by `save` of a model, a fit or a discovery."""
         from rotflex_jax.models.model_json import read  # imported on request: it needs this module
 
         return read(path).model
@@ -134,10 +134,10 @@ class Model:
         return dataclasses.replace(self, mechanism=self.mechanism.with_values(values))
 
     def at(self, recording: Recording) -> "Model":
-        """The model with the constants of a recording in the place of its own.
+        """The model with the constants of a recording in place of its own values.
 
         Raises:
-            InputError: A constant of an effect that the model has, under a name that the effect has not.
+            InputError: A constant belongs to an effect of the model, but the effect has no such parameter.
         """
         names, effects = self.mechanism.parameter_names, {(e.at, e.name) for e in self.mechanism.effects}
         for name in recording.constants:
@@ -152,7 +152,7 @@ class Model:
         return self.with_values(known) if known else self
 
     def measured(self, recording: Recording) -> Float[np.ndarray, "N C"]:
-        """The channels of a recording that the mechanism has as outputs, in its order."""
+        """The channels of a recording that are outputs of the mechanism, in the order of the outputs."""
         recording = single(recording, "recording")
         missing = [c for c in self.mechanism.channels if c not in recording.channels]
         if missing:
@@ -164,7 +164,7 @@ class Model:
         return np.stack([recording.channel(c) for c in self.mechanism.channels], axis=1)
 
     def inputs(self, recording: Recording) -> Float[np.ndarray, "N *c"]:
-        """The input of a recording (N,); with the signals that the mechanism has beside it (N, 1 + S).
+        """The input of a recording (N,); with the signals of the mechanism, if it has any, (N, 1 + S).
 
         Raises:
             InputError: The recording lacks one of these signals.
@@ -186,7 +186,7 @@ class Model:
         return np.ones(len(self.mechanism.effects)) if self.gates is None else np.array(self.gates)
 
     def _behind_actuation(self, recording: Recording) -> tuple[np.ndarray, "Model"]:
-        """The input of the model without its actuation, and that model: the voltage [V] is the motor's."""
+        """The voltage at the motor [V] (and signals), and the model without actuation that it drives."""
         v, acting, here = self.inputs(recording), effects_of(self.mechanism, Actuation), self.at(recording)
         if not acting:
             return v, here
@@ -201,7 +201,7 @@ class Model:
     def behind_actuation(self, recording: Recording) -> tuple["Model", Recording]:
         """The model without its actuation, and the recording with the voltage that reaches the motor.
 
-        In a part of that recording no delay, lag or drift starts again.
+        In a part of that recording, a delay, lag or drift does not start again.
         """
         v, inner = self._behind_actuation(recording)
         return inner, dataclasses.replace(recording, u=v if v.ndim == 1 else v[:, 0], accept=ACCEPTABLE)
@@ -214,8 +214,8 @@ class Model:
     def _start(self, recording: Recording) -> np.ndarray:
         """State at the start of a recording, from its first `n_init` samples.
 
-        States that no sensor measures come from a free run over the recording that this one continues; they
-        are at rest where it continues none.
+        States that no sensor measures come from a free run over the recording that this one continues. If it
+        continues none, they are at rest.
         """
         u, y = self.inputs(recording), self.measured(recording).astype(float)
         m, moving, before = recording.n_init, 2 * len(self.mechanism.coordinates), recording.continues
@@ -243,12 +243,11 @@ class Model:
     ) -> Float[np.ndarray, "N C"]:
         """Free run over a recording: outputs from its voltage alone.
 
-        The first state is estimated from the first `n_init` samples; the model uses no other measured
-        outputs.
+        The first state is estimated from the first `n_init` samples. No other measured outputs are used.
 
         Args:
             recording: Its voltage drives the model.
-            x0: First positions and speeds, where they are known.
+            x0: First positions and speeds, if they are known.
         """
         recording = single(recording, "recording")
         if x0 is None:
@@ -261,21 +260,21 @@ class Model:
         return self._run(recording, self._start(recording))[0]
 
     def simulate_windows(self, recording: Recording, seconds: float = 2.0) -> Float[np.ndarray, "N C"]:
-        """Outputs of free runs that start again every few seconds.
+        """Outputs of free runs over windows: the run starts again every few seconds.
 
-        Each starts from positions and speeds that are estimated on the first `n_init` samples of its window.
-        States that no sensor measures (memories, motor current) come from a free run over the whole
+        Each run starts from positions and speeds that are estimated on the first `n_init` samples of its
+        window. States that no sensor measures (memories, motor current) come from a free run over the whole
         recording, and actuation (a delay, a drift) acts on the voltage of the whole recording. The servo
-        angle integrates every small torque error, so one long run hides where the error arises.
+        angle integrates every small torque error, so a single long run hides where the error arises.
 
         Args:
             recording: Its voltage drives the model.
-            seconds: Length of a window [s]; a remainder of up to twice `n_init` belongs to the last one.
+            seconds: Length of a window [s]; a remainder of up to twice `n_init` belongs to the last window.
         """
         y = self.measured(recording).astype(float)
         u, inner = self._behind_actuation(recording)
         starts, length = window_starts(recording, seconds)
-        # Filled up, so that recordings of other lengths share the program.
+        # Filled up, so that recordings of different lengths share the program.
         many = np.minimum(np.arange(program_length(len(starts), least=8)), len(starts) - 1)
         pick = starts[many, None] + np.arange(program_length(length))[None, :]
         inside = np.minimum(pick, len(u) - 1)
@@ -303,13 +302,13 @@ class Model:
     ) -> Float[np.ndarray, "W n"]:
         """States in which free runs start again at some samples of a recording.
 
-        Positions and speeds are estimated on the first `n_init` samples from each on. States that no sensor
-        measures come from a free run over the whole recording, where it starts again not only at its start.
+        Positions and speeds are estimated on `n_init` samples, from each of these samples on. States that no
+        sensor measures come from a free run over the whole recording, unless all runs begin at its start.
 
         Args:
-            recording: It has at least `n_init` samples from each on.
-            begins: First samples.
-            moving: Positions and speeds, where they are known.
+            recording: It has at least `n_init` samples after each beginning.
+            begins: First samples of the runs.
+            moving: Positions and speeds, if they are known.
         """
         if moving is None and not begins.any():
             return self._start(recording)[None]
@@ -335,7 +334,7 @@ class Model:
         Args:
             recording: Voltage and measured outputs.
             process_noise: Port -> intensity of a white process torque [(N m)^2 s].
-            noise: Standard deviation of the sensor noise per channel.
+            noise: Standard deviation of the sensor noise of each channel.
         """
         y, m = self.measured(recording).astype(float), self.mechanism
         u, here, process_noise = (

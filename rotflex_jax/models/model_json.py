@@ -27,25 +27,25 @@ from rotflex_jax.text.numbers import json_number
 SCHEMA = 1
 KIND = "rotflex_jax model"
 LARGEST_FILE = 50_000_000
-"""Size of a model file beyond which it is none [bytes]."""
+"""Largest size of a file that is read as a model file [bytes]."""
 
 LARGEST_COUNT = 1000
-"""Of splines, substeps and the like, in a file."""
+"""Largest whole number in the settings of a file, such as a number of substeps."""
 
 _SOLVERS = {cls.__name__: cls for cls in (Exponential, SmoothRK4)}
 
 
 @dataclasses.dataclass(frozen=True)
 class Saved:
-    """What a model file holds.
+    """The contents of a model file.
 
     Attributes:
         model: The model.
-        estimates: Fitted and trusted parameters with their intervals, where the model came with a fit.
-        covariance: Of the parameters `covariance_names` [declared units], or None.
+        estimates: Fitted and trusted parameters with their intervals, if the model comes from a fit.
+        covariance: Covariance of the parameters `covariance_names` [declared units], or None.
         covariance_names: Full names, in the order of `covariance`.
-        Ts: Sampling period of the data it was fitted to [s], or None.
-        n_init: Samples at the start of these data that the model looked at, or None.
+        Ts: Sampling period of the data to which the model was fitted [s], or None.
+        n_init: Samples at the start of these data that the model may use, or None.
     """
 
     model: Model
@@ -60,15 +60,15 @@ def save(saved: Saved, path: str | os.PathLike[str]) -> Path:
     """Writes a model file.
 
     Args:
-        saved: What to write.
-        path: Of the file, which is replaced if it exists.
+        saved: Contents of the file.
+        path: Path of the file, which is replaced if it exists.
 
     Returns:
         The path.
 
     Raises:
-        InputError: An effect that is not in the catalogue, so that nobody could read it back, or a file
-            that cannot be written; an old one stays.
+        InputError: An effect is not in the catalogue, so the file could not be read back, or the file cannot
+            be written. An existing file then stays as it is.
     """
     if not isinstance(saved, Saved):
         raise InputError(
@@ -78,10 +78,10 @@ def save(saved: Saved, path: str | os.PathLike[str]) -> Path:
 
 
 def read(path: str | os.PathLike[str]) -> Saved:
-    """What a model file holds.
+    """Reads a model file.
 
     Raises:
-        InputError: No model file, one of a later version, or one with an effect that is not known here.
+        InputError: It is no model file, it is from a later version, or it has an effect that is not known.
     """
     path = path_of(path)
     try:
@@ -98,7 +98,7 @@ def read(path: str | os.PathLike[str]) -> Saved:
         ) from None
     except InputError:
         raise
-    except (ValueError, RecursionError, MemoryError):  # of JSON, UTF-8, a whole number of 5,000 digits
+    except (ValueError, RecursionError, MemoryError):  # no JSON, no UTF-8, or a whole number of 5,000 digits
         raise InputError(f"{path} is not JSON; give a file that `model.save` has written.") from None
     if not isinstance(data, dict) or data.get("kind") != KIND:
         raise InputError(f"{path} is no model file; give a file that `model.save` has written.")
@@ -106,7 +106,7 @@ def read(path: str | os.PathLike[str]) -> Saved:
         return from_dict(data)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-    except Exception as error:  # what a changed file holds reaches the constructor of any effect
+    except Exception as error:  # the values of a changed file reach the constructor of any effect
         reason = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
         raise InputError(
             f"{path} is incomplete or was changed by hand ({reason}); save the model again."
@@ -114,7 +114,7 @@ def read(path: str | os.PathLike[str]) -> Saved:
 
 
 def to_dict(saved: Saved) -> dict[str, Any]:
-    """Plain JSON types."""
+    """The contents of a model file in plain JSON types."""
     mechanism, model = saved.model.mechanism, saved.model
     covariance = saved.covariance
     return {
@@ -174,7 +174,7 @@ def _effect(effect: Effect, mechanism: Mechanism) -> dict[str, Any]:
 
 
 def _settings(effect: Effect) -> dict[str, Any]:
-    """Fields of an effect that are no parameters: what shape it has."""
+    """Fields of an effect that are no parameters, such as its number of splines."""
     known = {"at", *type(effect).declared()}
     return {f.name: _json(getattr(effect, f.name)) for f in dataclasses.fields(effect) if f.name not in known}
 
@@ -215,11 +215,11 @@ _FORM: dict[str, Any] = {
     "estimates": {"*": _ESTIMATE},
     "covariance": ({"names": [_TEXT], "matrix": [[(_NUMBER,)]]},),
 }
-"""What stands where: a list of one form has any length, `*` is any key, a form in parentheses may be null."""
+"""Form of a model file: a list of one form has any length, `*` is any key, parentheses allow null."""
 
 
 def _check(value: Any, form: Any, where: str) -> None:
-    """Raise `TypeError` where a value has not its form; `KeyError` where one is missing."""
+    """Raise `TypeError` where a value does not have its form, and `KeyError` where a value is missing."""
     if isinstance(form, tuple):
         return None if value is None else _check(value, form[0], where)
     if isinstance(form, str):
@@ -248,7 +248,7 @@ def _check(value: Any, form: Any, where: str) -> None:
 
 
 def _check_settings(value: Any, where: str, depth: int = 0) -> None:
-    """Raise `ValueError` for settings of no sensible size."""
+    """Raise `ValueError` if a setting has no sensible size."""
     if isinstance(value, dict | list) and depth < 5:
         for entry in value.values() if isinstance(value, dict) else value:
             _check_settings(entry, where, depth + 1)
@@ -264,10 +264,10 @@ def from_dict(data: Mapping[str, Any]) -> Saved:
     """The inverse of `to_dict`.
 
     Raises:
-        InputError: A later version, or an effect or solver that is not known here.
-        KeyError: Something is missing.
-        TypeError: Something has not the type that it must have.
-        ValueError: Something has no sensible size.
+        InputError: The file is from a later version, or has an effect or a solver that is not known.
+        KeyError: A value is missing.
+        TypeError: A value does not have the right type.
+        ValueError: A value has no sensible size.
     """
     if not isinstance(data["schema"], int) or data["schema"] > SCHEMA:
         raise InputError(
@@ -343,7 +343,7 @@ def _effect_back(given: Mapping[str, Any], units: Units) -> Effect:
 
 
 def _known(name: str) -> type[Effect] | None:
-    """An effect of the catalogue, or one of the package that no search tries."""
+    """An effect class by name: of the catalogue, or of the package if it is not in the catalogue."""
     offered = (e for e in vars(effects).values() if isinstance(e, type) and issubclass(e, Effect))
     return CATALOG.get(name) or next((e for e in offered if getattr(e, "name", "") == name), None)
 

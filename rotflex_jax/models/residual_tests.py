@@ -1,4 +1,4 @@
-"""Tests of residuals (white? dependent on the input?) and frequency responses with coherence."""
+"""Tests whether residuals are white and independent of the input; frequency responses with coherence."""
 
 import dataclasses
 
@@ -8,11 +8,11 @@ from jaxtyping import Bool, Complex, Float, Int, Real
 
 from rotflex_jax.errors import InputError
 
-# Stretches that are averaged, at least, half of each shared with the next.
+# Least number of stretches that are averaged; each overlaps the next by half.
 LEAST_STRETCHES = 7
-# A stretch is no longer than this [s]: lines that are closer say nothing of a joint.
+# Longest stretch [s]: a finer frequency resolution is of no use for a joint.
 LONGEST_STRETCH = 8.0
-# Frequencies closer than this many to a decade are taken together.
+# Largest number of frequencies in a decade; closer frequencies are averaged.
 BINS_PER_DECADE = 24
 
 
@@ -21,9 +21,10 @@ class FrequencyResponse:
     """Response of outputs to an input, from their spectra.
 
     Attributes:
-        frequency: [Hz].
-        response: By channel [unit of the output / unit of the input].
-        coherence: By channel, 0 to 1: the share of the output's power that follows the input linearly.
+        frequency: Frequencies [Hz].
+        response: Response of each channel [unit of the output / unit of the input].
+        coherence: Coherence of each channel, 0 to 1: the share of the output's power that follows the input
+            linearly.
     """
 
     frequency: Float[np.ndarray, " F"]
@@ -37,7 +38,7 @@ class FrequencyResponse:
 
     @property
     def phase_deg(self) -> Float[np.ndarray, "C F"]:
-        """Phase, within half a turn [deg]."""
+        """Phase between -180 and 180 [deg]."""
         return np.rad2deg(np.angle(self.response))
 
 
@@ -46,12 +47,12 @@ def frequency_response(u: Real[np.ndarray, " N"], y: Real[np.ndarray, "N C"], Ts
 
         H(f) = S_uy(f) / S_uu(f),    coherence = |S_uy|^2 / (S_uu S_yy)
 
-    Both are means over stretches of the recording under a Hann window, trends taken out of each, and over
-    neighbouring frequencies where they are many to a decade. The same estimate of a simulated run has
-    the same leakage, so that the two can be compared frequency by frequency.
+    Both are means over stretches of the recording with a Hann window, after a linear trend is removed from
+    each stretch, and over neighbouring frequencies where a decade has many of them. The same estimate of a
+    simulated run has the same leakage, so that the two can be compared frequency by frequency.
 
-    Not an unbiased response of the machine under feedback, where the input follows the noise; there the
-    simulated run, which the same input drives, is the fair comparison.
+    Under feedback the input depends on the noise, and the estimate is a biased response of the machine. The
+    fair comparison is then a simulated run that is driven by the same input.
 
     Args:
         u: Input [unit of the input].
@@ -78,12 +79,12 @@ def frequency_response(u: Real[np.ndarray, " N"], y: Real[np.ndarray, "N C"], Ts
 
 
 def _bins(f: Float[np.ndarray, " L"]) -> Int[np.ndarray, " F"]:
-    """Index of the first frequency of each bin; bins are single frequencies, then parts of a decade."""
+    """Index of the first frequency of each bin: low bins are single frequencies, others part of a decade."""
     part = np.floor(BINS_PER_DECADE * np.log10(f / f[0]) + 1e-9)
     return np.flatnonzero(np.diff(part, prepend=-1.0))
 
 
-# Quantile of the normal distribution that leaves 1 % on both sides together.
+# Quantile of the normal distribution for a two-sided probability of 99 %.
 QUANTILE_99 = 2.5758293035489004
 
 
@@ -94,13 +95,13 @@ class ResidualTests:
     Attributes:
         channels: Outputs, in order.
         Ts: Sampling period [s].
-        lags: From 0 [samples].
-        autocorrelation: Of each channel at each lag, 1 at lag 0 [-].
-        white_band: A white residual stays within plus and minus this in 99 of 100 lags [-].
-        input_lags: The residual comes so much after the input; negative ones show feedback [samples].
-        cross_correlation: Of each channel with the input [-].
-        input_band: A residual that is independent of the input stays within plus and minus this in 99 of 100
-            lags, by channel [-].
+        lags: Lags of the autocorrelation, from 0 [samples].
+        autocorrelation: Autocorrelation of each residual at each lag, 1 at lag 0 [-].
+        white_band: Half width of the band in which a white residual stays at 99 of 100 lags [-].
+        input_lags: Delay of the residual after the input; negative lags show feedback [samples].
+        cross_correlation: Correlation of each residual with the input [-].
+        input_band: For each channel, half width of the band in which a residual that is independent of the
+            input stays at 99 of 100 lags [-].
     """
 
     channels: tuple[str, ...]
@@ -114,12 +115,12 @@ class ResidualTests:
 
     @property
     def outside_white(self) -> Bool[np.ndarray, "C K"]:
-        """Lags at which a residual is not white; lag 0 is none."""
+        """Whether a residual is outside of its white band, at each lag; False at lag 0."""
         return (np.abs(self.autocorrelation) > self.white_band) & (self.lags > 0)
 
     @property
     def outside_input(self) -> Bool[np.ndarray, "C M"]:
-        """Lags at which a residual follows the input."""
+        """Whether a residual depends on the input (outside of its band), at each lag."""
         return np.abs(self.cross_correlation) > self.input_band[:, None]
 
     def sentences(self) -> list[str]:
@@ -153,13 +154,14 @@ def residual_tests(
         r_e(k) = sum_t e(t) e(t + k) / sum_t e(t)^2
         r_ue(k) = sum_t u(t) e(t + k) / sqrt(sum_t u(t)^2 sum_t e(t)^2)
 
-    with means removed. For white residuals r_e has the standard deviation 1 / sqrt(N); for residuals that
-    are independent of the input, r_ue has sqrt(sum_k r_e(k) r_u(k) / N), whatever their spectra.
+    with means removed. For white residuals r_e has the standard deviation 1 / sqrt(N). For residuals that are
+    independent of the input, r_ue has the standard deviation sqrt(sum_k r_e(k) r_u(k) / N), whatever their
+    spectra.
 
-    Not for a conclusion on physics at negative lags: under feedback the input follows the past residual.
+    Negative lags allow no conclusion on the physics: under feedback the input depends on past residuals.
 
     Args:
-        residual: Measured less modelled [unit of the channel].
+        residual: Measured less modelled outputs [unit of the channel].
         u: Input [unit of the input].
         Ts: Sampling period [s].
         channels: Names of the outputs.
@@ -169,7 +171,7 @@ def residual_tests(
         Both correlations with their bands.
 
     Raises:
-        InputError: Fewer than twice as many samples as lags.
+        InputError: There are fewer than `2 most + 2` samples.
 
     Source:
         T. Soderstrom, P. Stoica, System Identification, Prentice Hall, 1989, section 11.2.
@@ -183,11 +185,11 @@ def residual_tests(
     e = np.asarray(residual, float) - np.mean(residual, axis=0)
     v = np.asarray(u, float) - np.mean(u)
     lags, both = np.arange(most + 1), np.arange(-most, most + 1)
-    # Far lags matter for the band, since slow inputs and slow residuals look alike for long.
+    # Large lags matter for the band, since slow inputs and slow residuals stay correlated over many lags.
     far = min(N - 1, max(most, N // 4))
     own = np.stack([_correlation(x, x, 0, far) for x in e.T])
     of_input = _correlation(v, v, 0, far)
-    # Products at far lags are of few samples: weights that fall to zero keep the sum from being noise.
+    # Correlations at large lags come from few samples: weights that fall to zero keep their noise small.
     weight = 2.0 * (1.0 - np.arange(far + 1) / (far + 1))
     weight[0] = 1.0
     variance = np.maximum(own @ (weight * of_input), 1e-12) / N
@@ -206,7 +208,7 @@ def residual_tests(
 def _correlation(
     a: Float[np.ndarray, " N"], b: Float[np.ndarray, " N"], first: int, last: int
 ) -> Float[np.ndarray, " L"]:
-    """Normalised sums of a(t) b(t + k), for k from the first to the last lag; zeros where a signal rests."""
+    """Normalised sums of a(t) b(t + k) for k from the first to the last lag; zeros if a signal is zero."""
     N = len(a)
     size = 1 << (2 * N - 1).bit_length()
     sums = np.fft.irfft(np.conj(np.fft.rfft(a, size)) * np.fft.rfft(b, size), size)

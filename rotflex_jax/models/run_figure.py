@@ -16,7 +16,7 @@ from rotflex_jax.text.numbers import plain_number, readable
 from rotflex_jax.text.plotting import blank, styled, thinned
 from rotflex_jax.text.zoom import Line, LinePanel, LineView
 
-# A model that diverges must not hide what was measured: scales go no further than so many spans of it.
+# Limits of the axes, in spans of the measured signal: a model that diverges must not hide the measurement.
 MOST_SPANS, MOST_ERROR_SPANS = 2.0, 3.0
 
 
@@ -27,13 +27,13 @@ def run_figure(
     runs: Sequence[tuple[str, Float[np.ndarray, "N C"]]],
     title: str,
 ) -> Figure:
-    """Measured and simulated outputs over time, and below each channel what is left.
+    """Measured and simulated outputs over time, and the errors below each channel.
 
     Args:
-        recording: What was measured.
-        channels: Which of it, in the order of the columns of a run.
-        runs: Name and outputs of each model; what is not finite is left out.
-        title: Over the figure.
+        recording: Measured data.
+        channels: Channels that are shown, in the order of the columns of a run.
+        runs: Name and outputs of each model; values that are not finite are left out.
+        title: Title of the figure.
     """
     figure = blank(10.0, 2.9 * len(channels) + 0.4)
     axes = figure.subplots(
@@ -77,7 +77,7 @@ def _channel(
 
 
 def _limits(measured: Float[np.ndarray, " N"]) -> tuple[tuple[float, float], tuple[float, float]]:
-    """What the scales of a channel and of its errors do not go beyond."""
+    """Limits that the axes of a channel and of its errors do not exceed."""
     low, high = float(measured.min()), float(measured.max())
     span = (high - low) or 1.0
     error = MOST_ERROR_SPANS * span
@@ -87,14 +87,14 @@ def _limits(measured: Float[np.ndarray, " N"]) -> tuple[tuple[float, float], tup
 def run_panels(
     label: str, below: str, measured: Float[np.ndarray, " N"], runs: Sequence[Line], band: float = 0.0
 ) -> tuple[LinePanel, LinePanel]:
-    """Measured and simulated values of one channel to zoom, and the differences under them.
+    """Panels to zoom with the measured and simulated values of one channel, and their differences below.
 
     Args:
-        label: Of the upper scale, with its unit.
-        below: Of the lower one.
-        measured: What was measured.
-        runs: What models give.
-        band: Half width of what the sensor alone makes of the differences.
+        label: Label of the upper axis, with its unit.
+        below: Label of the lower axis, with its unit.
+        measured: Measured values.
+        runs: Simulated values of the models.
+        band: Half width of the band of the differences that the sensor alone causes.
     """
     errors = tuple(dataclasses.replace(r, values=measured - r.values, width=1.0) for r in runs)
     limits, error_limits = _limits(measured)
@@ -107,7 +107,7 @@ def run_panels(
 def run_view(
     recording: Recording, channels: Sequence[str], runs: Sequence[tuple[str, Float[np.ndarray, "N C"]]]
 ) -> LineView:
-    """The same as `run_figure` to pan and zoom."""
+    """The figure of `run_figure` in a form to pan and zoom."""
     panels = list[LinePanel]()
     for c, channel in enumerate(channels):
         scale, read = readable(1.0, recording.unit(channel))

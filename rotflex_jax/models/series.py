@@ -1,4 +1,4 @@
-"""A model of fixed weights on a basis, such as a Volterra series: the result of filters and linear fits."""
+"""A model with fixed weights on a basis, such as a Volterra series: the result of filters and linear fits."""
 
 import dataclasses
 from typing import Any
@@ -15,23 +15,23 @@ from rotflex_jax.recording.samples import require_period, sampling_period
 
 @dataclasses.dataclass(frozen=True)
 class Series:
-    """Weights in front of a basis of the input.
+    """A weighted sum of the regressors that a basis forms from the input.
 
         y_hat[t] = sum over p of w_p phi_p[t]
 
-    A function of the input alone, which is taken as zero before the first sample: the first samples, up to
-    the memory of the basis, are valid only if the plant started at rest.
+    The output depends on the input alone, which is taken as zero before the first sample: the first samples,
+    up to the memory of the basis, are valid only if the plant started at rest.
 
     Attributes:
-        basis: Turns the input into regressors.
-        weights: One per regressor.
-        channel: Output that it models.
-        Ts: Sampling period it holds for [s].
+        basis: Forms the regressors from the input.
+        weights: One weight for each regressor.
+        channel: Output that the series models.
+        Ts: Sampling period for which the series holds [s].
         input_unit: Unit of the input.
         output_unit: Unit of the output.
 
     Raises:
-        InputError: As many weights as there are regressors were not given, or they are not finite.
+        InputError: The weights are not as many as the regressors, or are not finite.
 
     >>> from rotflex_jax.basis import Delays, Volterra
     >>> series = Series(Volterra(Delays(2), order=1), np.array([0.5, 1.0, 2.0]), "alpha", 0.01)
@@ -74,10 +74,10 @@ class Series:
         return recording.channel(self.channel)[:, None]
 
     def simulate(self, recording: Recording) -> Float[np.ndarray, "N 1"]:
-        """Free run over a recording, from its input alone, in its precision.
+        """Free run over a recording, from its input alone, in the precision of the recording.
 
         Raises:
-            InputError: The sampling period is another one.
+            InputError: The recording has another sampling period.
         """
         require_period(self.Ts, recording.Ts, "The series holds")
         phi = self.basis.regressors(recording.u)
@@ -87,7 +87,7 @@ class Series:
         """Degree -> symmetric kernel in the domain of delays [output_unit / input_unit^degree].
 
         Args:
-            length: Delays from 0 to give [samples]; as far as the basis reaches unless given.
+            length: Number of delays, from 0 on [samples]; as far as the basis reaches if None.
         """
         return dict(self.basis.kernels(self.weights, length))
 

@@ -1,4 +1,4 @@
-"""A model under sliders: switch effects, change a parameter, and see what it does to the run."""
+"""Widgets for a model: switches of effects and sliders of parameters, with the resulting run and error."""
 
 import io
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -29,16 +29,16 @@ from rotflex_jax.text.markup import card, paragraph, table
 from rotflex_jax.text.numbers import plain_number, readable, unit_text
 from rotflex_jax.text.plotting import blank, legend_above, styled, thinned
 
-# Cells of the map of errors along each axis, and samples without which one stays blank.
+# Number of cells of the map of errors along each axis, and least number of samples of a cell that is drawn.
 ERROR_MAP_CELLS, ERROR_MAP_MIN_SAMPLES = 15, 5
-# Half width of the window in which a speed is taken from positions [s].
+# Half width of the window in which a speed is computed from positions [s].
 SPEED_HALF_WINDOW = 0.03
 
 
 def _cells(
     error: np.ndarray, seen: np.ndarray, over: tuple[np.ndarray, np.ndarray], edges: list[np.ndarray]
 ) -> np.ma.MaskedArray:
-    """Root mean square of an error in cells that have been visited often enough."""
+    """Root mean square of an error in the cells that contain enough samples."""
     total = np.histogram2d(*over, edges, weights=error**2)[0]
     return np.ma.masked_where(seen < ERROR_MAP_MIN_SAMPLES, np.sqrt(total / np.maximum(seen, 1)))
 
@@ -47,7 +47,7 @@ def _cells(
 def _figure(
     recording: Recording, y: np.ndarray, given: np.ndarray, now: np.ndarray, units: Mapping[str, str]
 ) -> Figure:
-    """Runs to the left, the error of the last one to the right."""
+    """Figure of the runs (left) and of the error of the last run (right)."""
     count = len(units)
     figure = blank(10.0, 1.9 * count + 0.5)
     axes = figure.subplots(count, 2, width_ratios=(1.9, 1.0), squeeze=False)
@@ -77,7 +77,7 @@ def _figure(
         now_rms, given_rms = (
             _cells(scale[c] * (y[:, c] - run[:, c]), seen, (speed, against), edges) for run in (now, given)
         )
-        # The scale holds the model as given, so that a better one looks paler.
+        # The scale includes the error of the given model, so that a better model looks paler.
         worst = max(float(np.ma.max(m)) if m.count() else 0.0 for m in (now_rms, given_rms)) or 1.0
         mesh = right.pcolormesh(*edges, now_rms.T, cmap="YlOrRd", vmin=0.0, vmax=worst)
         right.set_facecolor(NO_DATA)
@@ -96,13 +96,13 @@ def overlay(
     now: Float[np.ndarray, "N C"],
     units: Mapping[str, str],
 ) -> bytes:
-    """A PNG of three runs over time, and of the error over speed and deflection.
+    """A PNG of measured and simulated outputs over time, and of the error over speed and deflection.
 
     Args:
-        recording: What is drawn.
-        y: Its measured channels in the order of the model (N, C).
+        recording: Recording that is drawn.
+        y: Measured channels in the order of the model (N, C).
         given: Run of the model as it was given (N, C).
-        now: Run of the model as it stands (N, C).
+        now: Run of the model as it is set by the widgets (N, C).
         units: Channel -> its unit.
     """
     buffer = io.BytesIO()
@@ -110,17 +110,17 @@ def overlay(
     return buffer.getvalue()
 
 
-# A slider changes a parameter by up to this power of ten, either way.
+# A slider changes a parameter by a factor between 10^-SLIDER_DECADES and 10^SLIDER_DECADES.
 SLIDER_DECADES = 1.0
 
 
 class _State(NamedTuple):
-    """What the widgets say, for undoing.
+    """State of the widgets, stored for undo.
 
     Attributes:
-        base: The mechanism with the values that the sliders are factors of.
-        on: Effect, by its label -> whether its switch is on.
-        factors: Parameter -> its factor; 1 where it has none.
+        base: The mechanism with the values that the sliders multiply.
+        on: Label of an effect -> whether its switch is on.
+        factors: Parameter -> its factor; parameters without an entry have the factor 1.
         sliders: Parameters with a slider of their own.
     """
 
@@ -131,20 +131,20 @@ class _State(NamedTuple):
 
 
 class Explorer:
-    """A model, recordings, and widgets that change the one and show what it does to the other.
+    """Widgets that change a model and show its runs and errors on recordings.
 
-    Every state of switches and sliders runs through one compilation: switches are gates, parameters are
-    values. An effect that is added makes another one.
+    All states of switches and sliders share one compiled program: switches are gates, parameters are values.
+    Only an added effect needs another compilation.
 
     Attributes:
-        model: As it stands under the widgets.
+        model: The model as it is set by the widgets.
         errors: Channel -> root mean square error of short free runs over `test` [unit].
-        given: The same of the model as it was given.
-        switches: Effect, as "coulomb at hub" -> its checkbox.
-        parameter: Which parameter the slider changes.
-        factor: Slider: the parameter as a multiple of its given or refitted value.
-        sliders: Parameter -> a slider of its own, beside `factor`.
-        addable: Effects of the catalogue that can be added.
+        given: Channel -> the error of the model as it was given [unit].
+        switches: Label of an effect, such as "coulomb at hub" -> its checkbox.
+        parameter: Menu that selects the parameter for `factor`.
+        factor: Slider for the selected parameter, as a multiple of its given or refitted value.
+        sliders: Parameter -> its own slider, in addition to `factor`.
+        addable: Menu of the effects of the catalogue that can be added.
     """
 
     def __init__(
@@ -156,14 +156,14 @@ class Explorer:
         candidates: Iterable[Effect] = (),
         window_seconds: float = 2.0,
     ) -> None:
-        """Builds the widgets and shows the model as it is.
+        """Builds the widgets and shows the given model.
 
         Args:
-            model: What is explored.
-            recordings: Recording that is drawn, or several, of which the first is drawn; `refit` fits to all.
-            test: Recordings whose error is shown; the same ones if None.
+            model: The model.
+            recordings: One or several recordings; the first is drawn, and `refit` fits to all.
+            test: Recordings whose error is shown; `recordings` if None.
             candidates: Effects with their parameters that can be switched on; at first they are off.
-            window_seconds: Free runs are restarted after so long [s].
+            window_seconds: Length of the windows in which free runs are started again [s].
         """
         widgets = self._widgets = optional("ipywidgets", "Exploring a model")
         bare = model if isinstance(model, Mechanism) else _model(model).mechanism
@@ -213,7 +213,7 @@ class Explorer:
         def clicked(_: Any) -> None:
             try:
                 act()
-            except InputError as error:  # there is nobody else to tell in a notebook's callback
+            except InputError as error:  # a notebook would not show an exception in a callback
                 self._said = str(error)
                 self._show()
 
@@ -231,17 +231,19 @@ class Explorer:
             style={"description_width": "initial"},
         )
 
-    # -- what a person does ----------------------------------------------------------------------------
+    # -- actions of the user ---------------------------------------------------------------------------
 
     def add(self, effect: str, at: str) -> None:
-        """Adds an effect of the catalogue, switched on, at its default size or at a typical one.
+        """Adds an effect of the catalogue and switches it on.
+
+        The effect has its default parameters. If all its amplitudes are zero, the first gets a typical value.
 
         Args:
-            effect: Its name, as `"coulomb"`.
+            effect: Name of the effect, such as `"coulomb"`.
             at: Port, `input` or channel.
 
         Raises:
-            InputError: No such effect, or one that the model has or has no place for.
+            InputError: There is no such effect, the model has it already, or it cannot act at `at`.
         """
         cls = CATALOG[choose(effect, CATALOG, "effect")]
         if (effect, at) in {(e.name, e.at) for e in self._base.effects}:
@@ -250,7 +252,7 @@ class Explorer:
             )
         added = cls(at=at)
         if cls.amplitudes and not any(getattr(added, name) for name in cls.amplitudes):
-            first = cls.amplitudes[0]  # of size zero nothing would be seen, and no factor changes it
+            first = cls.amplitudes[0]  # an amplitude of zero has no effect, and no factor changes it
             added = added.replace(**{first: specifications(added)[first].typical})
         extended = self._base + added
         self._remember()
@@ -260,10 +262,10 @@ class Explorer:
         self._changed(None)
 
     def keep_slider(self, parameter: str) -> None:
-        """Gives a parameter a slider of its own, so that several can be moved in turn.
+        """Gives a parameter its own slider, so that several parameters can be moved in turn.
 
         Args:
-            parameter: Full name.
+            parameter: Full name of the parameter.
 
         Raises:
             InputError: The model has no such parameter.
@@ -276,7 +278,7 @@ class Explorer:
         self._show()
 
     def refit(self) -> None:
-        """Fits the free parameters of what is switched on to the recordings; sliders start from there."""
+        """Fits the free parameters of all effects that are on; sliders then multiply the fitted values."""
         on = self._stands()
         gates = on.gates or ()
         mechanism = on.mechanism
@@ -292,16 +294,16 @@ class Explorer:
         self._changed(None)
 
     def _meanwhile(self, line: str) -> None:
-        """Says what a long fit is doing, in the place of the errors."""
+        """Shows the progress of a fit in the place of the errors."""
         self._text.value = card("Refitting", paragraph(line))
 
     def undo(self) -> None:
-        """Takes the last change back; nothing where there is none."""
+        """Takes the last change back, if there is one."""
         if self._earlier:
             self._restore(self._earlier.pop())
 
     def reset(self) -> None:
-        """Everything as it was given."""
+        """Restores the model as it was given."""
         self._remember()
         self._restore(self._given)
 
@@ -312,7 +314,7 @@ class Explorer:
         return _State(self._base, on, dict(self._factors), tuple(self.sliders))
 
     def _remember(self) -> None:
-        """Keeps what stands now, once."""
+        """Stores the state that is shown for `undo`, unless it is stored already."""
         if not self._earlier or self._earlier[-1] != self._shown_state:
             self._earlier.append(self._shown_state)
 
@@ -322,7 +324,7 @@ class Explorer:
         self._update()
 
     def _build(self, on: Mapping[str, bool], sliders: Sequence[str]) -> None:
-        """The widgets of the effects and parameters that there are."""
+        """Builds the widgets for the present effects and parameters."""
         m, widgets = self._base, self._widgets
         self.switches = {
             label: widgets.Checkbox(value=on.get(label, True), description=label, indent=False)
@@ -353,7 +355,7 @@ class Explorer:
         self.factor.value = self._factors.get(self.parameter.value, 1.0)
 
     def _silently(self, change: Callable[[], Any]) -> None:
-        """Changes widgets without a simulation for each."""
+        """Changes widgets without a simulation after each change."""
         self._silent = True
         try:
             change()
@@ -387,7 +389,7 @@ class Explorer:
         self._update()
 
     def _stands(self) -> Model:
-        """The model that the widgets say."""
+        """The model as it is set by the widgets."""
         labels = [effect_label(e.name, e.at) for e in self._base.effects]
         gates = tuple(float(self.switches[x].value) if x in self.switches else 1.0 for x in labels)
         values = self._base.named_values
@@ -400,7 +402,7 @@ class Explorer:
         self._show()
 
     def _errors(self, model: Model) -> dict[str, float]:
-        """Root mean square error of short free runs, what a run may see not counted."""
+        """Root mean square error of short free runs, without the samples from which each run starts."""
         measured = [model.measured(r) for r in self._test]
         runs = [model.simulate_windows(r, self._seconds) for r in self._test]
         rms = windowed_rmse(self._test, measured, runs, self._seconds)
@@ -429,7 +431,7 @@ class Explorer:
         self._image.value = overlay(self._drawn, measured, given, now, self._units)
 
     def _ipython_display_(self) -> None:
-        from IPython.display import display  # a notebook asks, so it is there
+        from IPython.display import display  # IPython calls this method, so it is installed
 
         display(self.box)
 
@@ -446,10 +448,10 @@ def _model(given: Any) -> Model:
 
 
 def _labels(m: Mechanism) -> list[str]:
-    """Effects that have a switch, in order."""
+    """Labels of the effects that have a switch, in the order of the mechanism."""
     return [effect_label(e.name, e.at) for e in m.effects if _can_be_off(e)]
 
 
 def _can_be_off(effect: Effect) -> bool:
-    """Without inertia, spring or motor there is no machine; everything else can be left out."""
+    """Whether an effect can be switched off: all except linear ones such as inertia, spring and motor."""
     return not effect.is_linear or effect.name.startswith("viscous")

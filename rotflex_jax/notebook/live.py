@@ -1,4 +1,4 @@
-"""A search while it runs: the staircase of held-out errors grows in the notebook with every effect added."""
+"""Display of a running search in a notebook: the held-out errors after each effect that was added."""
 
 import sys
 import time
@@ -8,24 +8,24 @@ from rotflex_jax.discover.checkpoint import Milestone, TimeLeft
 from rotflex_jax.text.markup import card, paragraph, picture
 from rotflex_jax.text.svg import staircase
 
-# Redrawing more often than this [s] only makes a notebook flicker; a milestone is drawn at once.
+# Least time between two drawings [s], so that the notebook does not flicker; a milestone is drawn at once.
 REDRAW_PAUSE = 0.2
 
 
 def in_notebook() -> bool:
-    """Whether this process is the kernel of a notebook; nothing is loaded to find out."""
+    """Whether this process is the kernel of a notebook; the check imports nothing."""
     shell = sys.modules.get("IPython")
     here = shell.get_ipython() if shell is not None else None
     return here is not None and getattr(here, "kernel", None) is not None
 
 
 class Live:
-    """Follows a search, as its `progress`.
+    """Callable for the argument `progress` of a search, which displays its held-out errors so far.
 
     Attributes:
-        labels: One per model that was found so far.
+        labels: Label of each model found so far.
         errors: Channel with its unit -> held-out error of each model.
-        floor: The same channel -> noise of its sensor.
+        floor: Channel with its unit -> noise of the sensor.
     """
 
     def __init__(self, title: str, handle: Any = None) -> None:
@@ -39,7 +39,7 @@ class Live:
         self._time_left = TimeLeft()
 
     def __call__(self, line: str) -> None:
-        """Show a line of progress."""
+        """Shows a line of progress."""
         self._time_left.follow(line)
         new = isinstance(line, Milestone)
         if isinstance(line, Milestone):
@@ -69,18 +69,18 @@ class Live:
 def live(title: str = "Looking for what is missing") -> Live:
     """Progress of a search for a notebook: `rf.discover(joint, train, test, progress=rf.live())`.
 
-    In a notebook one line says what is being done, above the staircase of held-out errors so far. Anywhere
-    else it is silent and costs nothing.
+    In a notebook it shows the present step of the search, and below it a plot of the held-out errors so far.
+    Outside a notebook it shows nothing.
 
     Args:
-        title: Shown above it.
+        title: Title of the display.
 
     >>> follow = live()
     >>> follow("round 1: scoring 40 candidates")  # outside a notebook nothing is shown
     """
     if not in_notebook():
         return Live(title)
-    from IPython.display import display  # only where it is loaded already
+    from IPython.display import display  # in a notebook it is loaded already
 
     follow = Live(title)
     follow._handle = display(follow, display_id=True)

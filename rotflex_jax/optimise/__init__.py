@@ -1,1 +1,1 @@
-"""Minimisers that know nothing of recordings."""
+"""Minimisers that are independent of recordings and models."""

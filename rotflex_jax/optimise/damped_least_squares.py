@@ -1,20 +1,20 @@
-"""Damped least squares (Levenberg-Marquardt): the step, its damping and when to stop, for every fit.
+"""Damped least squares (Levenberg-Marquardt): the step, its damping and the stopping rules of every fit.
 
     f(x) = e'e / 2,   g = J'e,   H = J'J
     (H + damping diag H) s = -g,   |s_i| <= limit_i
 
-A step that lowers the cost is taken and divides the damping; one that does not multiplies it. The formulas
-hold for numpy arrays and, inside compiled code, for JAX arrays, and act along leading axes: one problem or
-a batch of them, each with a damping of its own.
+A step that lowers the cost is accepted, and the damping is divided by a factor. Any other step is refused,
+and the damping is multiplied. The formulas hold for numpy arrays and, inside compiled code, for JAX arrays.
+They act along leading axes: on one problem, or on a batch of problems, each with its own damping.
 
-Three callers, one set of formulas:
+Three functions share these formulas:
 
 - `minimise`: one problem, evaluated by a Python function;
-- `minimise_together`: several, evaluated by one call for all that still run;
+- `minimise_together`: several problems, with one evaluation for all that still run;
 - `minimise_compiled`: the loop inside a compiled program, also under `jax.vmap` and `jax.lax.map`.
 
-Equations of another form (a block structure, a triangular factor) take the place of `NormalEquations` by
-having `cost`, `step` and `predicted_decrease`.
+Equations of another form (a block structure, a triangular factor) can replace `NormalEquations` if they have
+`cost`, `step` and `predicted_decrease`.
 
 Source: K. Levenberg 1944, Quart. Appl. Math. 2; D. Marquardt 1963, SIAM J. Appl. Math. 11; J. Nocedal and
 S. Wright, Numerical Optimization, 2nd ed., 2006, sections 4.1 and 10.3.
@@ -31,20 +31,20 @@ import numpy as np
 from jaxtyping import Bool, Real, Shaped
 
 SHORT = 1e-3
-"""Damping above which a step is held short and says nothing of what is left to gain."""
+"""Damping above which a step is so short that it does not show how much the cost can still decrease."""
 RIDGE = 1e-14
-"""Damping that is always added, against rounding, as a share of the diagonal."""
+"""Damping that is always added, against rounding errors, as a share of the diagonal."""
 LARGEST_STEP = 1.0
-"""Most that an unconstrained coordinate moves in one step: of a logarithm, a factor of e."""
+"""Largest move of an unconstrained coordinate in one step; for a logarithm, a factor of e."""
 LEAST_CURVATURE = 1e-12
-"""Least entry of the diagonal that the damping is scaled by, as a share of the largest entry."""
+"""Least entry of the diagonal by which the damping is scaled, as a share of the largest entry."""
 
 Scalar = float | Shaped[Any, "..."]
-"""One number, or one for each problem of a batch."""
+"""One number, or one number for each problem of a batch."""
 
 
 class Status(enum.IntEnum):
-    """How a minimisation stands."""
+    """Status of a minimisation."""
 
     RUNNING = 0
     CONVERGED = 1
@@ -57,20 +57,21 @@ class Status(enum.IntEnum):
 class Rules(NamedTuple):
     """When a minimisation stops, and how the damping changes.
 
-    It converges where a step promises or brings a decrease of no more than `enough + enough_share |f|`,
-    unless the damping or a limit holds it short; where `window` evaluations bring less than
-    `least_progress`; or where the damping is beyond `largest`, so that no step lowers the cost.
+    A minimisation has converged in one of three cases. The predicted or the actual decrease of a step is no
+    more than `enough + enough_share |f|`, and neither the damping nor a limit makes the step short. Or
+    `window` evaluations lower the cost by less than `least_progress`. Or the damping exceeds `largest`, so
+    that no step lowers the cost.
 
     Attributes:
         enough: Decrease of the cost that is not worth a step.
-        enough_share: The same as a share of the cost.
-        window: Evaluations over which progress is measured.
-        least_progress: Least decrease over these; 0 for no such rule.
-        damping: At the start.
-        decrease: What a step that is taken divides the damping by.
-        increase: What a step that is refused multiplies it by.
+        enough_share: The same decrease as a share of the cost.
+        window: Number of evaluations over which progress is measured.
+        least_progress: Least decrease over these evaluations; 0 for no such rule.
+        damping: Damping at the start.
+        decrease: Factor by which an accepted step divides the damping.
+        increase: Factor by which a refused step multiplies the damping.
         least: Least damping.
-        largest: Damping at which the search ends.
+        largest: Damping above which the minimisation ends.
     """
 
     enough: Scalar = 0.0
@@ -89,7 +90,7 @@ def damped(H: Real[Any, "*batch n n"], damping: Scalar) -> Real[Any, "*damped n 
 
     Args:
         H: Product of the Jacobian with itself.
-        damping: One for each matrix, or several for one matrix.
+        damping: One number for each matrix, or several numbers for one matrix.
     """
     xp = _numpy(H)
     D = xp.diagonal(H, axis1=-2, axis2=-1)
@@ -103,14 +104,14 @@ def damped(H: Real[Any, "*batch n n"], damping: Scalar) -> Real[Any, "*damped n 
 def bounded_solution(
     A: Real[Any, "*batch n n"], b: Real[Any, "*batch n"], limit: Real[Any, "*#batch n"] | None = None
 ) -> tuple[Real[Any, "*batch n"], Shaped[Any, "*batch"]]:
-    """The `x` with `A x = b`, and whether a limit holds it short.
+    """The `x` with `A x = b`, and whether a limit is active.
 
-    Entries beyond their limit are held there, and the others solved for again.
+    Entries beyond their limit are fixed at the limit, and the other entries are solved for again.
 
     Args:
-        A: Positive definite.
+        A: Positive definite matrix.
         b: Right-hand side.
-        limit: Largest size of each entry, infinite for none; no entry has one if None.
+        limit: Largest absolute value of each entry, infinite for no limit; None for no limits at all.
     """
     xp = _numpy(A)
     size = xp.sqrt(xp.diagonal(A, axis1=-2, axis2=-1))
@@ -144,16 +145,16 @@ def solution_within(
     low: Real[np.ndarray, " n"],
     high: Real[np.ndarray, " n"],
 ) -> tuple[Real[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
-    """The `x` with the least `x'A x / 2 - b'x` and `low <= x <= high`, and which entries are at an end.
+    """The `x` with the least `x'A x / 2 - b'x` and `low <= x <= high`, and which entries are at a bound.
 
-    Entries beyond an end are held there and the others solved for again; one that would then rather come
-    back is let go, once.
+    Entries beyond a bound are fixed at the bound, and the other entries are solved for again. An entry whose
+    gradient then points inwards is released, once.
 
     Args:
-        A: Positive definite.
+        A: Positive definite matrix.
         b: Right-hand side.
         low: Least value of each entry, zero or less.
-        high: Largest value, zero or more.
+        high: Largest value of each entry, zero or more.
     """
     held, x = np.zeros(len(b), bool), np.zeros(len(b))
     released = held.copy()
@@ -165,14 +166,14 @@ def solution_within(
         back = held & ~released & np.where(x <= low, b - A @ x > 0, b - A @ x < 0)
         if not (over | back).any():
             break
-        # Those that come back do so when nothing else goes out, for they are tested with all others solved.
+        # Entries are released only when no other goes out, because the test needs all others solved.
         held, released = (held | over, released) if over.any() else (held & ~back, released | back)
     return x, held
 
 
 @runtime_checkable
 class Equations(Protocol):
-    """A cost and its quadratic model at one point; a tuple of arrays where it goes into compiled code."""
+    """A cost and its quadratic model at one point; in compiled code it must be a tuple of arrays."""
 
     @property
     def cost(self) -> Any:
@@ -180,18 +181,18 @@ class Equations(Protocol):
         ...
 
     def step(self, damping: Any, limit: Any) -> Any:
-        """Damped step within the limits, and whether a limit holds it short."""
+        """Damped step within the limits, and whether a limit is active."""
         ...
 
     def predicted_decrease(self, step: Any) -> Any:
-        """By how much the quadratic model falls along a step."""
+        """Decrease of the quadratic model along a step."""
         ...
 
 
 class NormalEquations(NamedTuple):
-    """Half the squared residuals of G groups (channels, say), gradient `J'e`, and `H = J'J`.
+    """Half the squared residuals of G groups (such as channels), gradient `J'e`, and `H = J'J`.
 
-    The cost may be another one with this gradient, such as a logarithm of a likelihood.
+    The cost may be another function with this gradient, such as the logarithm of a likelihood.
     """
 
     costs: Real[Any, "*batch G"]
@@ -200,7 +201,7 @@ class NormalEquations(NamedTuple):
 
     @classmethod
     def of(cls, J: Real[Any, "*batch m n"], e: Real[Any, "*batch m"]) -> "NormalEquations":
-        """Of residuals and their Jacobian."""
+        """The equations of residuals `e` and their Jacobian `J`."""
         xp = _numpy(J)
         return cls(
             xp.sum(e * e, axis=-1)[..., None] / 2,
@@ -216,7 +217,7 @@ class NormalEquations(NamedTuple):
     def step(
         self, damping: Scalar, limit: Real[Any, "*#batch n"] | None = None
     ) -> tuple[Real[Any, "*damped n"], Shaped[Any, "*damped"]]:
-        """Damped Gauss-Newton step, not finite where the equations are not, and whether a limit holds it."""
+        """Damped Gauss-Newton step, and whether a limit is active; NaN if the equations are not finite."""
         A = damped(self.H, damping)
         xp = _numpy(A)
         right = xp.broadcast_to(-self.gradient, A.shape[:-1])
@@ -225,19 +226,19 @@ class NormalEquations(NamedTuple):
         return bounded_solution(A, right, limit)
 
     def predicted_decrease(self, step: Real[Any, "*batch n"]) -> Real[Any, "*batch"]:
-        """`-(g's + s'H s / 2)`."""
+        """Decrease of the quadratic model along a step, `-(g's + s'H s / 2)`."""
         xp = _numpy(step)
         bent = xp.einsum("...i,...ij,...j->...", step, self.H, step)
         return -(xp.sum(self.gradient * step, axis=-1) + bent / 2)
 
 
 class Progress(NamedTuple):
-    """How far a minimisation is; each entry is one number, or one for each problem of a batch.
+    """Progress of a minimisation; each entry is one number, or one number for each problem of a batch.
 
     Attributes:
-        cost: The least so far.
-        damping: Of the next step.
-        evaluations: Steps tried.
+        cost: Least cost so far.
+        damping: Damping of the next step.
+        evaluations: Number of steps that were tried.
         reference: Cost when progress was last measured.
         status: A `Status`.
     """
@@ -250,7 +251,7 @@ class Progress(NamedTuple):
 
 
 def begin(cost: Scalar, rules: Rules) -> Progress:
-    """Progress at the start, with the cost there."""
+    """Progress at the start point, which has this cost."""
     xp = _numpy(cost)
     status = xp.where(xp.isfinite(cost), int(Status.RUNNING), int(Status.DIVERGED))
     none = xp.zeros_like(cost)
@@ -261,10 +262,10 @@ def before_trial(progress: Progress, finite: Any, limited: Any, predicted: Scala
     """Ends a minimisation whose next step is not worth a run.
 
     Args:
-        progress: So far.
+        progress: Progress so far.
         finite: Whether the step is finite.
-        limited: Whether a limit holds it short, so that it says nothing of what is left to gain.
-        predicted: Decrease that it promises.
+        limited: Whether a limit makes the step short, so that it does not show how much can still be gained.
+        predicted: Predicted decrease of the cost by the step.
         rules: When to stop.
     """
     xp = _numpy(progress.cost)
@@ -277,16 +278,16 @@ def before_trial(progress: Progress, finite: Any, limited: Any, predicted: Scala
 
 
 def after_trial(progress: Progress, cost: Scalar, rules: Rules) -> tuple[Progress, Any]:
-    """The progress after a step was tried, and whether it is taken.
+    """The progress after a step was tried, and whether the step is accepted.
 
     Args:
-        progress: Before.
-        cost: After the step; may be infinite or not a number.
+        progress: Progress before the step.
+        cost: Cost after the step; may be infinite or NaN.
         rules: When to stop, and how the damping changes.
     """
     xp = _numpy(progress.cost)
     gain = progress.cost - cost
-    accepted = gain > 0  # not where it is not a number
+    accepted = gain > 0  # False for NaN
     lowered = xp.maximum(progress.damping / rules.decrease, rules.least)
     damping = xp.where(accepted, lowered, progress.damping * rules.increase)
     cost = xp.where(accepted, cost, progress.cost)
@@ -309,10 +310,10 @@ class Minimum:
     Attributes:
         x: The point.
         first: Equations at the start.
-        equations: Equations at the point, or where they were last made if costs are evaluated apart.
+        equations: Equations at the point, or at the last point with equations if costs are evaluated alone.
         cost: Cost at the point.
-        evaluations: Steps tried.
-        status: RUNNING where the evaluations were used up.
+        evaluations: Number of steps that were tried.
+        status: RUNNING if the evaluations were used up.
     """
 
     x: Any
@@ -335,18 +336,19 @@ def minimise_together(
     max_steps: int = 60,
     report: Callable[[Sequence[Progress]], None] | None = None,
 ) -> list[Minimum]:
-    """Minimises several costs, independent of each other, with one evaluation for all that still run.
+    """Minimises several independent costs, with one evaluation for all problems that still run.
 
     Args:
-        linearise: Equations at points, in their order.
-        starts: First point of each; anything that `move` knows.
+        linearise: Returns the equations at points, in their order.
+        starts: First point of each problem, of any type that `move` takes.
         rules: When to stop, and how the damping changes.
-        limit: Largest step along each coordinate of problem i; None for no limits.
-        costs: Costs at points, where these are cheaper than equations; the equations' own if None.
-        move: The point that a step leads to.
-        unit: From equations, what `enough` and `least_progress` count in, 1 or more; asked for after each
-            window of evaluations, and again before a minimisation ends by it.
-        max_steps: Most steps that are tried of each.
+        limit: Returns the largest step along each coordinate of problem i; None for no limits.
+        costs: Returns the costs at points, if these are cheaper than equations; None to use the cost of the
+            equations.
+        move: Returns the point after a step.
+        unit: Returns from equations the unit, 1 or more, of `enough` and `least_progress`. It is called after
+            each window of evaluations, and again before a minimisation ends by these.
+        max_steps: Largest number of steps that are tried for each problem.
         report: Called after each round.
     """
     points, first = list(starts), list(linearise(list(starts)))
@@ -362,7 +364,7 @@ def minimise_together(
         return rules._replace(enough=enough, least_progress=least)
 
     def ends_too_early(i: int) -> bool:
-        """Whether a minimisation ended in a unit that is smaller by now; it is renewed."""
+        """Whether a minimisation ended although its unit has become much smaller; renews the unit."""
         if units[i] == 1.0 or progress[i].status != Status.CONVERGED or unit is None:
             return False
         before, units[i] = units[i], float(unit(equations[i]))
@@ -397,7 +399,7 @@ def minimise_together(
                 progress[i] = progress[i]._replace(status=np.asarray(int(Status.RUNNING)))
             elif unit is not None and runs(i) and progress[i].evaluations % rules.window == 0:
                 units[i] = float(unit(equations[i]))
-        # Where only costs were evaluated, equations are made if another step follows.
+        # If only costs were evaluated, equations are computed where another step follows.
         follow = [i for i in accepted if runs(i)] if costs else []
         if follow:
             for i, e in zip(follow, linearise([points[i] for i in follow]), strict=True):
@@ -422,7 +424,7 @@ def minimise(
     max_steps: int = 60,
     report: Callable[[Progress], None] | None = None,
 ) -> Minimum:
-    """Minimises one cost; arguments as in `minimise_together`, for one point.
+    """Minimises one cost; arguments as in `minimise_together`, but for one problem.
 
     >>> A, b = np.array([[1.0, 0.0], [1.0, 1.0], [1.0, 2.0]]), np.array([1.0, 3.0, 5.0])
     >>> found = minimise(lambda x: NormalEquations.of(A, A @ x - b), np.zeros(2), Rules(enough=1e-20))
@@ -445,21 +447,21 @@ def minimise(
 def minimise_compiled(
     linearise: Callable[[Any], Any], start: Any, rules: Rules, *, limit: Any = None, max_steps: Any = 60
 ) -> tuple[Any, Any, Progress]:
-    """The same as a loop in compiled code; for use inside of `jax.jit`, `jax.vmap` or `jax.lax.map`.
+    """Minimises one cost by a loop in compiled code, inside of `jax.jit`, `jax.vmap` or `jax.lax.map`.
 
     Args:
-        linearise: Equations at a point, a pytree of arrays.
-        start: First point, an array or a pytree of them; a step is one of the same kind.
+        linearise: Returns the equations at a point, a pytree of arrays.
+        start: First point, an array or a pytree of arrays; a step has the same structure.
         rules: When to stop, and how the damping changes.
-        limit: As the equations' `step` takes it.
-        max_steps: Most evaluations, that of the start included.
+        limit: Limits for the method `step` of the equations.
+        max_steps: Largest number of evaluations, including the one at the start.
 
     Returns:
         The point, the equations there, and the progress.
     """
     none = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), jax.eval_shape(linearise, start))
     unknown = jnp.full_like(none.cost, jnp.inf)
-    # The start is the first trial, against an infinite cost, so that a run is compiled once and not twice.
+    # The start is the first trial, compared with an infinite cost, so that a run is compiled only once.
     progress = begin(unknown, rules)._replace(
         damping=jnp.zeros_like(unknown) + rules.damping * rules.decrease,
         status=jnp.asarray(int(Status.RUNNING)),
@@ -494,5 +496,5 @@ def _identity(like: Any) -> Any:
 
 
 def _numpy(array: Any) -> Any:
-    """The functions for an array: those of JAX inside of compiled code."""
+    """The array library of an array: `jax.numpy` for JAX arrays, else numpy."""
     return jnp if isinstance(array, jax.Array) else np

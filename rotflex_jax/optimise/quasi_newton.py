@@ -1,4 +1,4 @@
-"""Quasi-Newton minimisation (BFGS) from several starts, where some points have no value: filters diverge."""
+"""Quasi-Newton minimisation (BFGS) from several starts; points may have no value, if a filter diverges."""
 
 import dataclasses
 from collections.abc import Callable
@@ -11,19 +11,19 @@ from rotflex_jax.optimise.damped_least_squares import LARGEST_STEP
 Values = tuple[Float[np.ndarray, " S"], Float[np.ndarray, "S n"]]
 
 SMALLEST_STEP = 1e-5
-"""Steps below this end a descent."""
+"""A descent ends when its step is shorter than this."""
 GRADIENT_TOLERANCE = 1e-4
-"""Gradient below which a point counts as the minimum; of a logarithm, a share of 0.01 %."""
+"""Gradient below which a point counts as the minimum; for the logarithm of a cost, 0.01 % of the cost."""
 
 
 @dataclasses.dataclass
 class Descent:
-    """One start and where it led.
+    """A descent from one start.
 
     Attributes:
         points: accepted points (K, n), the start first.
-        values: of the function there.
-        evaluations: points tried, refused ones too.
+        values: values of the function at these points.
+        evaluations: number of points tried, including refused points.
         status: "minimum", "no further progress", "evaluations used up" or "no finite value".
     """
 
@@ -35,7 +35,7 @@ class Descent:
 
 @dataclasses.dataclass
 class _Search:
-    """One start: BFGS with backtracking; it receives the value at `trial` and sets the next."""
+    """BFGS with backtracking from one start: it receives the value at `trial` and sets the next trial."""
 
     record: Descent
     trial: np.ndarray
@@ -62,11 +62,11 @@ class _Search:
             self._accept(f, g)
             self._set_direction()
             return
-        # The minimum of a parabola through both values and the slope; without a value half the step.
+        # Minimum of the parabola through both values and the slope; half the step if there is no value.
         curvature = 2 * (f - self.f - slope) if finite else np.inf
         self.share *= float(np.clip(-slope / curvature, 0.1, 0.5)) if finite else 0.5
         if self.share * np.max(np.abs(self.direction)) < SMALLEST_STEP:
-            if self.H is not None:  # it may be that of another region: again along the gradient
+            if self.H is not None:  # it may belong to another region: try again along the gradient
                 self.H = None
                 self._set_direction()
                 return
@@ -91,7 +91,7 @@ class _Search:
         self.H = left @ H @ left.T + np.outer(step, step) / curved
 
     def _set_direction(self) -> None:
-        """Quasi-Newton direction, no longer than allowed; the negative gradient where it does not descend."""
+        """Quasi-Newton direction of limited length; the negative gradient if that is no descent direction."""
         assert self.x is not None and self.g is not None
         direction = -self.g if self.H is None else -self.H @ self.g
         if float(direction @ self.g) >= 0:
@@ -104,15 +104,15 @@ class _Search:
 def descend(
     function: Callable[[Float[np.ndarray, "S n"]], Values], starts: Float[np.ndarray, "S n"], evaluations: int
 ) -> list[Descent]:
-    """Minimises from several starts at once, one batched evaluation per round.
+    """Minimises from several starts at once, with one batched evaluation per round.
 
     A value that is not finite only shortens a step and never enters a quasi-Newton matrix. A start
-    that has none moves half the way towards the best start that has one.
+    without a finite value moves halfway towards the best start with a finite value.
 
     Args:
-        function: values (S,) and gradients (S, n) at points (S, n).
+        function: returns values (S,) and gradients (S, n) at points (S, n).
         starts: first points (S, n).
-        evaluations: most points to try per start.
+        evaluations: largest number of points that are tried for each start.
     """
     searches = [_Search(Descent([], []), np.array(x)) for x in starts]
     for _ in range(evaluations):

@@ -1,4 +1,4 @@
-"""A recording: what was measured, checked once when it is made and never changed after."""
+"""A recording: measured input and outputs, checked once when it is created and never changed afterwards."""
 
 from rotflex_jax.recording.quality import Finding as Finding
 from rotflex_jax.recording.recording import Recording as Recording

@@ -1,4 +1,4 @@
-"""Samples that do not continue the signal: wrapped angles, outliers, sensors that stand still."""
+"""Samples that do not continue the signal: wrapped angles, outliers, frozen sensors."""
 
 from typing import NamedTuple
 
@@ -6,23 +6,23 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 MOST_OUTLIERS = 10
-"""Places at which a signal may be out of line; where there are more, it moves so."""
+"""Largest number of places with outliers; a signal with more such places is taken to move like that."""
 
 LONGEST_OUTLIER = 20
-"""Samples that one place may have."""
+"""Largest number of samples at one such place."""
 
 FAR_OUT = 8.0
-"""How many times the motion of a sample a jump is that is out of line."""
+"""Least size of the jump to an outlier, in largest usual motions from one sample to the next."""
 
 JUMP_FROM_REST = 3.0
-"""The same for the jump that ends a stretch in which nothing was measured: what is at rest starts slowly."""
+"""Least size of the jump after a frozen stretch, in the same unit: real motion from rest starts slowly."""
 
 SHORTEST_STILL, SHORTEST_STILL_SECONDS = 20, 0.05
-"""Least length of such a stretch, both in samples and in seconds."""
+"""Least length of a frozen stretch in samples and in seconds, both of which must be met."""
 
 
 def motion(x: Float[np.ndarray, " N"]) -> float:
-    """How far a signal moves from one sample to the next at most, up to `MOST_OUTLIERS` outliers aside.
+    """Largest motion of a signal from one sample to the next, without the steps of `MOST_OUTLIERS` outliers.
 
     >>> x = np.arange(100.0)
     >>> x[50] = -9999
@@ -34,7 +34,7 @@ def motion(x: Float[np.ndarray, " N"]) -> float:
 
 
 def wraps(x: Float[np.ndarray, " N"], turn: float) -> Int[np.ndarray, " W"]:
-    """The samples behind which an angle jumps by a whole turn, within the motion of the samples around.
+    """The samples after which an angle jumps by a whole turn, up to the motion of the samples around.
 
     Args:
         x: angle.
@@ -47,7 +47,7 @@ def wraps(x: Float[np.ndarray, " N"], turn: float) -> Int[np.ndarray, " W"]:
     steps = np.diff(x)
     size = np.abs(steps)
     jumps = np.flatnonzero((size > 0.5 * turn) & (size < 1.5 * turn))
-    # What moves by a good part of a turn from sample to sample, as noise may, jumps by a whole one by chance.
+    # A signal that often moves by a large part of a turn, such as noise, jumps by a whole turn by chance.
     between = int(np.sum((size > 0.25 * turn) & (size < 0.75 * turn)))
     if len(jumps) > len(x) // 10 or between > min(2 * MOST_OUTLIERS, len(x) // 10):
         return jumps[:0]
@@ -63,7 +63,7 @@ def wraps(x: Float[np.ndarray, " N"], turn: float) -> Int[np.ndarray, " W"]:
 def unwrapped(
     x: Float[np.ndarray, " N"], behind: Int[np.ndarray, " W"], turn: float
 ) -> Float[np.ndarray, " N"]:
-    """An angle without the jumps by a whole turn behind these samples, to check it for other faults.
+    """An angle without the jumps by a whole turn after these samples, to check it for other faults.
 
     >>> unwrapped(np.array([3.0, -3.0]), np.array([0]), 6.25)
     array([3.  , 3.25])
@@ -74,14 +74,14 @@ def unwrapped(
 
 
 def outliers(x: Float[np.ndarray, " N"], least: float = 0.0) -> Bool[np.ndarray, " N"]:
-    """Which samples are out of line with their neighbours on both sides.
+    """Which samples are outliers: out of line with their neighbours on both sides.
 
-    They jump by `FAR_OUT` times what the signal moves otherwise, and a few samples later back to where it
-    has gone on.
+    The signal jumps to them by more than `FAR_OUT` times its usual motion, and a few samples later jumps back
+    to where it would be without them.
 
     Args:
         x: signal.
-        least: jumps up to this size are motion, of a machine that mostly rests for instance [unit of x].
+        least: size up to which a jump counts as motion, for instance of a machine mostly at rest [unit of x].
 
     >>> x = np.sin(np.arange(200) / 20)
     >>> x[120:123] = -9999
@@ -108,7 +108,7 @@ def outliers(x: Float[np.ndarray, " N"], least: float = 0.0) -> Bool[np.ndarray,
 
 
 def without(x: Float[np.ndarray, " N"], out: Bool[np.ndarray, " N"]) -> Float[np.ndarray, " N"]:
-    """A signal with lines in the place of some samples, to check it for other faults.
+    """A signal with straight lines in place of some samples, to check it for other faults.
 
     >>> without(np.array([1.0, 50.0, 2.0]), np.array([False, True, False]))
     array([1. , 1.5, 2. ])
@@ -120,14 +120,14 @@ def without(x: Float[np.ndarray, " N"], out: Bool[np.ndarray, " N"]) -> Float[np
 
 
 class Still(NamedTuple):
-    """A stretch in which nothing was measured.
+    """A frozen stretch, in which nothing was measured.
 
     Attributes:
-        first: First sample of it.
-        last: Last sample of it.
-        channel: Column that jumps most behind it, measured by how it moves otherwise.
-        jump: How far.
-        alone: Whether the other channels move meanwhile.
+        first: First sample of the stretch.
+        last: Last sample of the stretch.
+        channel: Column with the largest jump after the stretch, relative to its usual motion.
+        jump: Size of this jump.
+        alone: Whether other channels move during the stretch.
     """
 
     first: int
@@ -138,12 +138,12 @@ class Still(NamedTuple):
 
 
 def frozen(u: Float[np.ndarray, " N"], y: Float[np.ndarray, "N C"], Ts: float) -> Still | None:
-    """The first stretch in which sensors stand still though the machine moved.
+    """The first stretch in which sensors are frozen although the machine moved.
 
-    A machine that is held by friction stands still too, and starts slowly. What tells a sensor or a log that
-    stands still is a jump at the end, to where the machine has gone meanwhile, while the input has varied as
-    it does where the machine moves. One channel alone must jump to its value too, as to the zeros of a
-    sensor that was lost.
+    A machine that is held by friction stands still too, but starts slowly. A frozen sensor or log shows by a
+    jump at the end of the stretch, to where the machine has moved in the meantime, while the input varied as
+    it does during motion. If one channel alone is constant, it must also jump at the beginning of the
+    stretch, as a lost sensor jumps to zero.
 
     Args:
         u: input.
@@ -180,14 +180,14 @@ def frozen(u: Float[np.ndarray, " N"], y: Float[np.ndarray, "N C"], Ts: float) -
 
 
 def _constant(moves: Bool[np.ndarray, " M"], least: int) -> list[tuple[int, int]]:
-    """First and last samples of stretches without a step, of at least so many samples."""
+    """First and last samples of stretches without motion that have at least `least` samples."""
     edges = np.flatnonzero(np.diff(~moves, prepend=False, append=False))
     pairs = zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True)
     return [(first, last) for first, last in pairs if last - first + 1 >= least]
 
 
 def _driven(u: Float[np.ndarray, " N"], moves: Bool[np.ndarray, " M"], first: int, last: int) -> bool:
-    """Whether the input varies there, over `SHORTEST_STILL` samples, as it mostly does in motion."""
+    """Whether the input varies in this stretch as it mostly does in motion, over `SHORTEST_STILL` samples."""
     starts = np.arange(0, len(u) - SHORTEST_STILL + 1, SHORTEST_STILL // 2)
     span = np.ptp(np.lib.stride_tricks.sliding_window_view(u, SHORTEST_STILL)[starts], axis=1)
     moving = np.array([np.any(moves[k : k + SHORTEST_STILL - 1]) for k in starts])

@@ -1,12 +1,12 @@
 """Faults and properties of a recording: reported, never repaired.
 
-A joint with dry friction is at rest for long, often at the end of its motion, and its encoder quantises:
-neither is a fault, and the checks here distinguish them from one.
+A joint with dry friction is often at rest for a long time, also at the end of its motion, and its encoder
+quantises. Neither is a fault, and the checks here do not take them for one.
 
 A spring that carries only an inertia deflects in proportion to an acceleration, so at low frequency a
 deflection falls with the square of the frequency: `alpha / theta = w^2 / (w_n^2 - w^2)`. The absolute
 angle of the arm is `theta + alpha`, and `(theta + alpha) / theta = 1 / (1 - w^2 / w_n^2)` tends to one. A
-deflection is as large as theta at one frequency at most; an octave above, their ratio is far from one.
+deflection is as large as theta at no more than one frequency; an octave above, their ratio is far from one.
 """
 
 from collections.abc import Mapping, Sequence
@@ -23,14 +23,14 @@ from rotflex_jax.recording.continuity import Still, frozen, motion, outliers, un
 def quantisation_step(x: Float[np.ndarray, " N"]) -> float | None:
     """The step of a quantised signal.
 
-    All distinct values must lie on one lattice, to 5 % of its step, so that text rounded to a few
-    digits counts too. A chance lattice among m free values has probability below 0.1^(m - 1).
+    All distinct values must lie on one lattice, to 5 % of its step, so that values rounded to a few digits in
+    a text file count too. A chance lattice among m free values has a probability below 0.1^(m - 1).
 
     Args:
         x: the signal.
 
     Returns:
-        The step [unit of x], None where the values are on no lattice, or never repeat.
+        The step [unit of x]; None if the values are on no lattice, never repeat, or are fewer than ten.
 
     >>> t = np.arange(1000) / 100
     >>> quantisation_step(0.25 * np.round(8 * np.sin(t) / 0.25))
@@ -40,7 +40,7 @@ def quantisation_step(x: Float[np.ndarray, " N"]) -> float | None:
     """
     rounding = 16 * np.finfo(x.dtype).eps * np.max(np.abs(x))
     levels = np.unique(x).astype(np.float64)
-    # Equal values that arithmetic has moved apart by a rounding error are one level.
+    # Values that differ only by the rounding error of arithmetic are one level.
     levels = levels[np.diff(levels, prepend=-np.inf) > rounding]
     if len(levels) < 10 or len(levels) == len(x):
         return None
@@ -60,20 +60,20 @@ def quantisation_step(x: Float[np.ndarray, " N"]) -> float | None:
 def cut_off(
     x: Float[np.ndarray, " N"], step: float | None, u: Float[np.ndarray, " N"], Ts: float
 ) -> tuple[float, int] | None:
-    """The end of a sensor's range, where the signal would have gone further.
+    """The end of a sensor's range at which the signal is cut off.
 
-    A joint may rest exactly at the end of its motion, so many equal samples prove nothing. What proves
-    saturation is a signal that arrives and leaves without slowing down, or one that stays while the input
-    is at its strongest in both directions.
+    A joint may rest exactly at the end of its motion, so many equal samples prove nothing. Saturation is
+    proved by a signal that arrives at the end and leaves it without slowing down, or that stays there while
+    the input is at its strongest in both directions.
 
     Args:
         x: signal.
-        step: its quantisation step, None if there is none [unit of x].
+        step: quantisation step of the signal, None if there is none [unit of x].
         u: input.
         Ts: sampling period [s].
 
     Returns:
-        The end [unit of x] and the number of samples there, None where nothing is cut off.
+        The end [unit of x] and the number of samples there; None if the signal is not cut off.
 
     >>> wave = np.sin(np.arange(2000) / 50)
     >>> cut_off(wave, None, wave, 0.002)
@@ -91,25 +91,25 @@ def cut_off(
 def _passes_straight(z: Float[np.ndarray, " N"], there: Bool[np.ndarray, " N"], step: float) -> bool:
     """Whether the signal arrives at an end and leaves it without slowing down.
 
-    What stops or turns follows a parabola: over the last distance D it needs twice the time that it
-    needs over the last D / 4; what is cut off goes straight on, and needs four times. The ratio of
-    these times, over all visits together, must be above 2.5 for arriving and for leaving.
+    A motion that stops or turns follows a parabola: over the last distance D it needs twice the time that it
+    needs over the last D / 4. A signal that is cut off goes straight on, and needs four times as long. The
+    ratio of these times, over all visits together, must be above 2.5 for arriving and for leaving.
     """
     far = max(40 * step, 0.1 * z.max())
     visits = 0
     near_times = far_times = np.zeros(2)
-    while far <= 0.5 * z.max():  # a motion of a few steps tells nothing
+    while far <= 0.5 * z.max():  # a motion of a few steps is no evidence
         visits, near_times, far_times = _passing_times(z, there, step, far)
         if np.sum(far_times) >= 12 * visits:
             break
-        far *= 2  # so few samples on the way that a half at each end counts
+        far *= 2  # too few samples: half a sample at each end would matter
     return visits >= 2 and bool(np.all(far_times > 2.5 * near_times))
 
 
 def _passing_times(
     z: Float[np.ndarray, " N"], there: Bool[np.ndarray, " N"], step: float, far: float
 ) -> tuple[int, Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
-    """The visits to an end, and the samples from `far / 4` and from `far`, arriving and leaving."""
+    """Number of visits to an end, and times [samples] within `far / 4` and `far`, arriving and leaving."""
     edges = np.flatnonzero(np.diff(z < far / 4, prepend=False, append=False))
     beyond = np.concatenate([[-np.inf], np.flatnonzero(z >= far), [np.inf]])
     visits, near_times, far_times = set(), np.zeros(2), np.zeros(2)
@@ -119,12 +119,12 @@ def _passing_times(
             continue
         first, last = at_end[0], at_end[-1]
         nearest = np.searchsorted(beyond, first)
-        # The end is reached half a sample before the first there, and left half a sample late.
+        # The end is reached half a sample before the first sample there, left half a sample after the last.
         arriving = first - start + 0.5, first - beyond[nearest - 1] - 0.5
         leaving = stop - last - 0.5, beyond[nearest] - last - 0.5
         for side, (near, full) in enumerate((arriving, leaving)):
-            # Beyond six it has paused on the way, or not come from further away: no evidence.
-            # In its time at the end it must have had more to go than a turning point can hide.
+            # Above a ratio of six it paused on the way, or did not come from further away: no evidence. In
+            # its time at the end it must have had further to go, at its speed, than a turning point can hide.
             if full < 6 * near and len(at_end) * far / 4 / near > 3 * np.sqrt(step * far):
                 visits.add(start)
                 near_times[side] += near
@@ -133,7 +133,7 @@ def _passing_times(
 
 
 def _is_driven(there: Bool[np.ndarray, " N"], u: Float[np.ndarray, " N"], Ts: float) -> bool:
-    """Whether the input is at its strongest, both ways, in the longest stay at an end."""
+    """Whether the input is at its strongest, in both directions, during the longest stay at an end."""
     edges = np.flatnonzero(np.diff(there, prepend=False, append=False))
     stay = np.argmax(edges[1::2] - edges[::2])
     start, stop = edges[2 * stay], edges[2 * stay + 1]
@@ -148,17 +148,17 @@ def _is_driven(there: Bool[np.ndarray, " N"], u: Float[np.ndarray, " N"], Ts: fl
 
 
 SLOW_BANDS = ((1, 4, 0.05), (4, 8, 0.15))
-"""Slow motion: first harmonic of the recording, harmonic after the last, tolerance of a slope of one."""
+"""Bands of slow motion: first harmonic of the recording, harmonic after the last, tolerance of slope one."""
 
 LEAST_COHERENCE, LEAST_SLOW_SHARE = 0.99, 0.003
-"""In each band: of the two angles, and of the hub's motion in the band in all of it."""
+"""Least coherence of the two angles in each band; least share of the hub's whole motion in each band."""
 
 
 def is_absolute(theta: Float[np.ndarray, " N"], alpha: Float[np.ndarray, " N"]) -> bool:
     """Whether alpha follows theta one to one in slow motion, in each of two bands.
 
-    False where there is no slow motion, as in a short recording or one of a single sine: there a
-    deflection may look the same.
+    False if there is no slow motion, as in a short recording or with a single sine: a deflection may then
+    look the same.
 
     Args:
         theta: angle of the hub [rad].
@@ -184,16 +184,16 @@ def is_absolute(theta: Float[np.ndarray, " N"], alpha: Float[np.ndarray, " N"]) 
 
 
 IN_DIGESTS = ("short", "constant_input", "constant", "saturated", "units", "absolute", "swapped", "huge")
-"""Faults that a part of a recording accepts as its digest says it: results are stored with digests."""
+"""Accepted faults in the digest of a part of a recording; fixed, since results are stored by digest."""
 
 ACCEPTABLE = (*IN_DIGESTS, "slow", "wrapped", "outliers", "frozen")
-"""Faults that a user can accept by name; all others have no sensible reading."""
+"""Faults that a user can accept by name; with any other fault the data have no sensible meaning."""
 
 DOUBTED = ("units", "absolute", "swapped", "outliers", "frozen")
-"""Warnings for which a file is refused, unless they are accepted."""
+"""Warnings for which a file is refused unless they are accepted."""
 
 SHORTEST_RECORDING = 50
-"""Samples below which no fit makes sense."""
+"""Number of samples below which no fit makes sense."""
 
 
 @dataclass(frozen=True)
@@ -201,10 +201,10 @@ class Finding:
     """A fault or property of a recording.
 
     Args:
-        kind: short name, such as `quantised`; the name to accept it by where that is possible.
-        channel: the signal it is about.
-        message: one sentence for a person.
-        severity: `note` (as it should be known), `warning` (look at it) or `error` (refused).
+        kind: short name, such as `quantised`; if the fault can be accepted, it is accepted by this name.
+        channel: the signal to which the finding belongs.
+        message: one sentence for the user.
+        severity: `note` (good to know), `warning` (check it) or `error` (refused).
     """
 
     kind: str
@@ -232,17 +232,17 @@ def inspect(
         u: input.
         y: outputs.
         Ts: sampling period [s].
-        names: of the input and then of the outputs.
-        units: in the same order.
-        resolution: quantisation step of each output, where there is one [unit of the output].
-        accept: kinds of errors that are to be warnings.
+        names: names of the input and then of the outputs.
+        units: units in the same order.
+        resolution: quantisation step of each output, if there is one [unit of the output].
+        accept: kinds of errors that become warnings.
         start: time of the first sample [s].
 
     Returns:
         The findings; `refuse` raises the errors among them.
     """
     found = [_short(u), _slow(Ts, units[1:]), *_of_input(u, names[0], units[0])]
-    y, gaps = _continued(u, y, Ts, names[1:], units[1:], start)  # other faults are looked for beside gaps
+    y, gaps = _continued(u, y, Ts, names[1:], units[1:], start)  # gaps must not hide other faults
     found += gaps
     for x, name, unit in zip(y.T, names[1:], units[1:], strict=True):
         if _still(x):
@@ -302,7 +302,7 @@ def _short(u: Float[np.ndarray, " N"]) -> Finding | None:
 
 
 SLOWEST_SAMPLING = 0.5
-"""Sampling period at which an angle of a joint says nothing of its motion [s]."""
+"""Sampling period from which the samples of an angle no longer show the motion of a joint [s]."""
 
 
 def _slow(Ts: float, units: Sequence[str]) -> Finding | None:
@@ -322,7 +322,7 @@ def _size(x: float, unit: str) -> str:
 def _wrapped(
     x: Float[np.ndarray, " N"], Ts: float, name: str, start: float
 ) -> tuple[Float[np.ndarray, " N"], Finding | None]:
-    """The angle without jumps by a whole turn, and what is said of them."""
+    """The angle without jumps by a whole turn, and the finding on them."""
     for turn, jump, cure in (
         (2 * np.pi, "a whole turn, 6.283 rad (360 deg)", " (period=360 for a column in degrees)"),
         (360.0, "360, a whole turn in degrees", "(..., period=360), and pass degrees=True"),
@@ -342,7 +342,7 @@ def _wrapped(
 def _outliers(
     x: Float[np.ndarray, " N"], Ts: float, name: str, unit: str, start: float
 ) -> tuple[Float[np.ndarray, " N"], Finding | None]:
-    """The signal with lines in the place of outliers, and what is said of them."""
+    """The signal with outliers replaced by straight lines, and the finding on them."""
     out = outliers(x, FASTEST * Ts if unit == "rad" else 0.0)
     if not out.any():
         return x, None
@@ -364,7 +364,7 @@ def _continued(
     units: Sequence[str],
     start: float,
 ) -> tuple[Float[np.ndarray, "N C"], list[Finding]]:
-    """The outputs with lines in the place of what does not continue them, and what is said of that."""
+    """The outputs with wraps, outliers and frozen stretches removed, and the findings on these."""
     columns, said = [], []
     for x, name, unit in zip(y.T, names, units, strict=True):
         wrapped = None
@@ -419,7 +419,7 @@ def _of_input(u: Float[np.ndarray, " N"], name: str, unit: str) -> list[Finding]
         return [Finding("constant_input", name, message, "error")]
     found = []
     levels, counts = np.unique(u, return_counts=True)
-    # A two-level or stepped input holds every level for long; a clipped one only the extremes.
+    # A two-level or stepped input holds every level for a long time; a clipped input only the extremes.
     often = max(5.0, 0.005 * len(u), 5.0 * float(np.median(counts)))
     ends = [f"{levels[k]:g}" for k in (0, -1) if counts[k] >= often and levels[k] != 0]
     if len(levels) >= 10 and ends:
@@ -460,11 +460,11 @@ IF_CONVERTED = {
     IF_DEGREES_OR_TIME: "the unit of the time looks wrong, or that of the angle; correct time_unit= or Ts=, "
     "or accept=('units',) if both are right.",
 }
-"""Advice on a channel in radians -> that on one that was degrees or counts and has been converted already."""
+"""Advice on a channel in radians -> advice on a channel that was converted from degrees or counts already."""
 
 
 def converted(finding: Finding) -> Finding:
-    """The finding for a channel that was degrees or counts and has been converted already."""
+    """The finding with its advice for a channel that was converted from degrees or counts already."""
     message = finding.message
     for advice, instead in IF_CONVERTED.items():
         message = message.replace(advice, instead)
@@ -472,17 +472,17 @@ def converted(finding: Finding) -> Finding:
 
 
 FASTEST = 60.0
-"""Speed that a geared servo does not reach [rad/s]."""
+"""Speed that no geared servo reaches [rad/s]."""
 
 
 def _like_degrees(
     x: Float[np.ndarray, " N"], u: Float[np.ndarray, " N"], Ts: float, name: str, input_unit: str
 ) -> Finding | None:
-    """Angles beyond what a joint can do in radians.
+    """Finding on angles that are too large or too fast to be radians.
 
-    A deflection of half a turn is none. A geared servo makes about 2 rad/s per volt, in degrees
-    100; the limit lies between them, for the speed over 20 ms, which noise does not reach. Of a
-    recording below 40 ms it is the speed over half of it.
+    No deflection exceeds half a turn. A geared servo turns at about 2 rad/s per volt; read as radians, its
+    degrees would be about 100 per volt. The limit lies between the two. It applies to the speed over 20 ms,
+    which noise does not reach; in a recording below 40 ms, to the speed over half of the recording.
     """
     lag = max(1, min(round(0.02 / Ts), len(x) // 2))
     speed = np.max(np.abs(x[lag:] - x[:-lag]), initial=0.0) / (lag * Ts)
@@ -499,11 +499,11 @@ def _like_degrees(
 
 
 MOST_WHOLE = 20
-"""Span beyond which whole numbers are no angle in radians."""
+"""Span from which whole numbers cannot be an angle in radians."""
 
 
 def whole_numbers(x: Float[np.ndarray, " N"]) -> bool:
-    """Whether a signal takes whole numbers only, over more than an angle in radians spans.
+    """Whether a signal has only whole numbers, over a span that is too large for an angle in radians.
 
     >>> k = np.arange(100.0)
     >>> whole_numbers(k), whole_numbers(0.5 * k), whole_numbers(k % 5)
@@ -536,11 +536,11 @@ def _absolute_angle(y: Float[np.ndarray, "N C"], names: Sequence[str]) -> Findin
 
 
 SWAPPED_RATIO = 3.0
-"""How many times the hub's motion a deflection cannot be in slow motion."""
+"""Ratio to the hub's motion that a deflection cannot exceed in slow motion."""
 
 
 def _spectrum(x: Float[np.ndarray, " N"]) -> Complex[np.ndarray, " F"]:
-    """Fourier transform without the mean; with low side lobes a band does not leak into others."""
+    """Fourier transform without the mean; the window has low side lobes, so bands do not leak into others."""
     window = np.blackman(len(x))
     return np.fft.rfft(window * (x - window @ x / window.sum()))
 
@@ -549,8 +549,8 @@ def is_swapped(theta: Float[np.ndarray, " N"], alpha: Float[np.ndarray, " N"]) -
     """Whether alpha moves far more than theta in slow motion, in each of two bands, as the hub does.
 
     Args:
-        theta: what is given as the angle of the hub [rad].
-        alpha: what is given as the deflection of the arm [rad].
+        theta: angle that is given as that of the hub [rad].
+        alpha: angle that is given as the deflection of the arm [rad].
 
     >>> t = np.linspace(0, 10, 5000)
     >>> theta, alpha = np.cos(t) + 0.3 * np.sin(3 * t), 0.02 * np.cos(t) + 0.5 * np.sin(20 * t)

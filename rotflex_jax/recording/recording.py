@@ -33,7 +33,7 @@ from rotflex_jax.text.numbers import plain_number, readable
 
 
 def _known_remarks(given: Any) -> tuple[Finding, ...]:
-    """Findings of whoever made the recording."""
+    """The findings that the maker of the recording gives, checked."""
     listed: tuple[Any, ...] = (given,)
     if isinstance(given, Sequence) and not isinstance(given, str):
         listed = tuple(given)
@@ -50,38 +50,39 @@ def _known_remarks(given: Any) -> tuple[Finding, ...]:
 class Recording:
     """One experiment: the input, the outputs and the sampling period, uniformly sampled.
 
-    `u[k]` and `signals[name][k]` are held over `[k Ts, (k + 1) Ts)`; `y[k]` is measured at its start.
+    `u[k]` and `signals[name][k]` are held over `[k Ts, (k + 1) Ts)`; `y[k]` is measured at the start of this
+    interval.
 
-    Not for data sampled unevenly: resample them first, with a method you can defend.
+    Not for unevenly sampled data: resample them first, with a method that you can justify.
 
     Args:
         u: input (N,) [input_unit].
-        y: outputs (N, C), or (N,) for one [units].
+        y: outputs (N, C), or (N,) for one output [units].
         Ts: sampling period [s].
-        channels: names of the outputs; `("theta", "alpha")` for two, `("theta",)` for one.
-        units: of the outputs; radians unless given.
+        channels: names of the outputs; by default `("theta", "alpha")` for two, `("theta",)` for one.
+        units: units of the outputs; radians by default.
         input_name: name of the input.
-        input_unit: its unit.
-        n_init: samples at the start that a model may look at and that are not scored; those of
-            0.2 s unless given, at least 10 and at most a quarter of the recording.
-        source: where it comes from.
+        input_unit: unit of the input.
+        n_init: number of samples at the start that a model may use and that are not scored; by default 0.2 s,
+            but at least 10 samples and at most a quarter of the recording.
+        source: where the recording comes from.
         start: time of the first sample [s].
         accept: faults to accept, which then are findings of severity `warning`: `short`,
             `constant_input`, `constant`, `saturated`, `units`, `absolute`, `swapped`, `huge`, `slow`,
             `wrapped`, `outliers`, `frozen`.
-        resolution: quantisation step by channel, where it is known; found from the data otherwise.
-        continues: the recording that ended where this one starts, if any; a part of a recording knows the
-            part before it. States that no sensor shows (a warm motor) continue from there.
-        remarks: findings on where it comes from, such as rows that were lost, which its parts keep.
-        constants: what is known of the machine in this recording and may be otherwise in another, such as the
-            gain that a servo was set to: full name of a parameter to its value. A model simulates this
-            recording with it, and a fit holds it; what a model has not is no concern of it.
-        signals: what was measured of all else that acts on the machine beside the input, such as the
-            acceleration of what it stands on (a measured disturbance): name with the unit in brackets to
-            samples (N,), which are held as the input is.
+        resolution: quantisation step of a channel, if it is known; otherwise it is found from the data.
+        continues: the recording that ended where this one starts, if any. A part of a recording has the part
+            before it. States that no sensor measures (the temperature of a motor) continue from there.
+        remarks: findings on the source, such as lost rows. Parts of the recording keep them.
+        constants: full name of a parameter -> its value, for values that are known in this recording and may
+            differ in another, such as the gain of a servo. A model simulates this recording with these
+            values, and a fit holds them. Names that a model does not have are ignored.
+        signals: name with unit in brackets -> samples (N,), for measured quantities other than the input that
+            act on the machine, such as the acceleration of the base (a measured disturbance). They are held
+            between samples like the input.
 
     Raises:
-        InputError: the data are not what they must be.
+        InputError: the data are not valid.
 
     >>> u = np.sin(np.arange(100.0))
     >>> recording = Recording(u=u, y=0.01 * np.cumsum(u), Ts=0.01, source="an integrator")
@@ -166,7 +167,7 @@ class Recording:
         }
         for name, value in values.items():
             object.__setattr__(self, name, value)
-        # A part of a recording accepts everything: its findings are computed when they are needed.
+        # A part of a recording accepts all faults: its findings are computed when they are needed.
         if self.accept != quality.ACCEPTABLE:
             quality.refuse(self.findings)
 
@@ -195,10 +196,10 @@ class Recording:
         return self.N * self.Ts
 
     def inputs(self, signals: Iterable[str]) -> Float[np.ndarray, "N m"]:
-        """The input, and beside it some of the signals, in columns.
+        """The input and some of the signals, in columns.
 
         Raises:
-            InputError: The recording lacks one of them.
+            InputError: The recording lacks one of these signals.
         """
         signals = tuple(signals)
         if missing := [name for name in signals if name not in self.signals]:
@@ -232,9 +233,9 @@ class Recording:
         return self.channels.index(channel)
 
     def slice(self, i: int, j: int) -> "Recording":
-        """The samples from `i` up to, but without, `j`.
+        """The samples from `i` up to, but not including, `j`.
 
-        A part that is short, or at rest, is no error: the whole has passed the checks.
+        A part that is short, or at rest, is no error: the whole recording has passed the checks.
         """
         ends = [real(end) for end in (i, j)]
         if not all(0 <= end <= self.N and end == int(end) for end in ends) or i >= j:
@@ -251,18 +252,18 @@ class Recording:
             start=self.start + i * self.Ts,
             n_init=min(self.n_init, max(1, (j - i) // 4)),
             accept=quality.ACCEPTABLE,
-            # One sample alone is no recording to continue.
+            # A single sample is no recording that could be continued.
             continues=self.slice(0, i) if i > 1 else self.continues if not i else None,
         )
 
     def split(
         self, share: float | None = None, *, seconds: float | None = None
     ) -> tuple["Recording", "Recording"]:
-        """Cuts the recording in two, in the order of time: one part for training, one for validation.
+        """Cuts the recording into two consecutive parts: one for training, one for validation.
 
         Args:
-            share: of the samples in the first part [-]; 0.7 where neither is given.
-            seconds: length of the first part instead [s].
+            share: share of the samples in the first part [-]; 0.7 if neither argument is given.
+            seconds: length of the first part [s], instead of `share`.
 
         Returns:
             The first and the second part.
@@ -284,14 +285,14 @@ class Recording:
         return self.slice(0, round(wanted)), self.slice(round(wanted), self.N)
 
     def decimate(self, k: int) -> "Recording":
-        """Every k-th sample: the mean of input and signals over k samples, the output as it was measured.
+        """Every k-th sample: means of the input and of the signals over k samples, outputs unfiltered.
 
         The mean keeps the impulse of the held input, to first order in `k Ts`. The output is not
-        filtered: a filter would have to be part of the model, and angles have next to no content
-        beyond the new Nyquist frequency. Not for outputs with strong noise there, which is aliased.
+        filtered: a filter would have to be part of the model, and angles have almost no content
+        above the new Nyquist frequency. Not for outputs with strong noise there, which is aliased.
 
         Args:
-            k: factor; samples at the end that do not fill a group are left out.
+            k: factor; samples at the end that do not fill a group of k are left out.
         """
         factor = real(k)
         if not (1 <= factor <= self.N and factor == int(factor)):
@@ -315,10 +316,10 @@ class Recording:
         )
 
     def with_signals(self, signals: Mapping[str, Any]) -> "Recording":
-        """The recording with these signals in the place of its own.
+        """The recording with these signals in place of its own.
 
-        A part of a recording then knows no part before it, since that one has other signals: give them to the
-        whole recording before it is cut.
+        A part of a recording then loses the part before it, which has other signals. Give signals to the
+        whole recording before you cut it.
 
         Args:
             signals: as in `Recording`.
@@ -330,7 +331,7 @@ class Recording:
         return replace(self, signals=signals, continues=None if signals else self.continues)
 
     def _repr_html_(self) -> str:
-        """What was measured: extent, ranges, steps of the sensors, findings, and the signals over time."""
+        """Extent, ranges, steps of the sensors, findings, and the measured signals over time."""
         rows, panels = [], []
         outputs = zip(self.channels, self.units, self.y.T, strict=True)
         columns = [(self.input_name, self.input_unit, self.u, None)]
@@ -343,7 +344,7 @@ class Recording:
             std = plain_number(factor * float(np.std(values)))
             rows.append((name, read, f"{plain_number(low)} … {plain_number(high)}", std, quantum))
             lines = [(factor * np.asarray(values, float), FINAL, "")]
-            label = f"{name} [{read}]"  # beside an axis there is room for so much; the table says it all
+            label = f"{name} [{read}]"  # an axis has room for so much; the table has all
             panels.append(svg.Panel(label if len(label) <= 15 else f"{label[:14]}…", lines))
         rate = f"{self.N} samples, {self.duration:g} s at {1 / self.Ts:g} Hz"
         return card(
@@ -366,14 +367,14 @@ class Recording:
 
 
 FEWEST_MOVING = 20
-"""Samples that differ from the one before; with fewer, two recordings may be alike by chance."""
+"""Least number of samples that differ from the one before; with fewer, a match may be by chance."""
 LEAST_SHARED = 0.25
-"""Share of the shorter recording that both must have in common to be called pieces of one."""
+"""Least share of the shorter recording that two pieces of one recording must have in common."""
 _PROBES = 16
 
 
 def content(recording: Recording) -> tuple[bytes, ...]:
-    """All of a recording that a computation can depend on, as bytes; not the name of its file."""
+    """Everything in a recording on which a computation can depend, as bytes; not the name of its file."""
     r = recording
     labels = (r.Ts, r.channels, r.units, r.input_name, r.input_unit)
     accepted = quality.IN_DIGESTS if r.accept == quality.ACCEPTABLE else r.accept
@@ -381,12 +382,12 @@ def content(recording: Recording) -> tuple[bytes, ...]:
     labels = (*labels, sorted(r.constants.items()), *sorted(r.signals))
     arrays = (r.u, r.y, *(r.signals[name] for name in sorted(r.signals)))
     own = (repr(labels).encode(), *(np.ascontiguousarray(a).tobytes() for a in arrays))
-    # States that no sensor measures start where a run over the recording before ends.
+    # States that no sensor measures start from the end of a run over the recording before.
     return own if r.continues is None else (*own, *content(r.continues))
 
 
 def digest_of(*parts: bytes) -> str:
-    """SHA-256 of several parts, each counted with its length."""
+    """SHA-256 of several parts, each preceded by its length."""
     found = hashlib.sha256()
     for part in parts:
         found.update(len(part).to_bytes(8, "big") + part)
@@ -394,18 +395,18 @@ def digest_of(*parts: bytes) -> str:
 
 
 def digest_of_recordings(recordings: Sequence[Recording]) -> str:
-    """Digest of all that a fit can depend on in several recordings, in their order."""
+    """Digest of everything in several recordings on which a fit can depend, in their order."""
     return digest_of(*(part for r in recordings for part in content(r)))
 
 
 def shared_samples(a: Recording, b: Recording) -> int:
-    """How many samples two recordings have in common because both were cut from one, 0 if they were not.
+    """How many samples two recordings have in common because both were cut from one; 0 if they were not.
 
-    They count as cut from one where one is shifted against the other such that the whole stretch in which
-    both have samples is the same, number for number, in input and outputs. Standstill proves nothing: the
-    first `LEAST_SHARED` of the shorter one must have `FEWEST_MOVING` samples that differ from the one before.
+    They count as cut from one if some shift makes the whole stretch in which both have samples identical,
+    number for number, in input and outputs. Standstill proves nothing: the first `LEAST_SHARED` of the
+    shorter recording must have `FEWEST_MOVING` samples that differ from the sample before.
     """
-    # Periods that are read off time stamps differ a little between pieces of one file.
+    # Periods that are computed from time stamps differ a little between pieces of one file.
     if not math.isclose(a.Ts, b.Ts, rel_tol=0.01) or a.y.shape[1] != b.y.shape[1]:
         return 0
     first, second = (np.column_stack([r.u, r.y]) + 0.0 for r in (a, b))  # one zero, without a sign
@@ -420,7 +421,7 @@ def _shared_from(a: np.ndarray, b: np.ndarray) -> int:
     moving = 1 + np.flatnonzero(np.any(b[1:least] != b[: least - 1], axis=1))
     if len(moving) < FEWEST_MOVING:
         return 0
-    # A few samples that differ from the one before leave next to no other shift to be compared as a whole.
+    # A few moving samples are compared first; they leave almost no wrong shift to be compared as a whole.
     count, at = len(a) - least + 1, int(moving[0])
     shifts = np.flatnonzero(a[at : at + count, -1] == b[at, -1])
     for at in moving[np.linspace(0, len(moving) - 1, _PROBES).astype(int)]:
@@ -434,7 +435,7 @@ def _shared_from(a: np.ndarray, b: np.ndarray) -> int:
 
 
 def _one_after_the_other(a: Recording, b: Recording) -> bool:
-    """Whether two parts know that one ends before the other begins: a signal may repeat itself."""
+    """Whether one part is known to end before the other begins; a periodic signal may look the same."""
     first, second = sorted((a, b), key=lambda r: r.start)
     before = second.continues
     if before is None or first.start + (first.N - 0.5) * first.Ts > second.start:
@@ -447,8 +448,8 @@ def _one_after_the_other(a: Recording, b: Recording) -> bool:
 def of_one_run(a: Recording, b: Recording) -> bool:
     """Whether two recordings are parts of one run, or the same one.
 
-    Parts that were cut from one recording know how it began (`continues`). Two runs may begin with the same
-    standstill, so the beginning that both know must have `FEWEST_MOVING` samples that differ from the one
+    Parts that were cut from one recording have its beginning (`continues`). Two different runs may begin with
+    the same standstill, so the common beginning must have `FEWEST_MOVING` samples that differ from the sample
     before.
     """
     first, second = (_beginning(r) for r in (a, b))
@@ -460,7 +461,7 @@ def of_one_run(a: Recording, b: Recording) -> bool:
     return bool(moving >= FEWEST_MOVING) and np.array_equal(here, there)
 
 
-# What two parts of one run of one machine have in common.
+# Attributes that two parts of one run of one machine have in common.
 _OF_ONE_MACHINE = ("Ts", "channels", "units", "input_name", "input_unit", "constants")
 
 
@@ -470,9 +471,9 @@ def common_signals(recordings: Sequence[Recording]) -> tuple[str, ...]:
 
 
 def joined(recordings: Sequence[Recording]) -> tuple[Recording, ...]:
-    """Recordings in their order, where parts of one run that follow on each other are one recording.
+    """Recordings in their order, with adjoining parts of one run joined to one recording.
 
-    One that goes on where a later one of the sequence ends stands in the place of that one.
+    The joined recording has the position of the part that is first in time.
     """
     found = list(recordings)
     for r in sorted(recordings, key=lambda r: r.start):
@@ -489,13 +490,13 @@ def joined(recordings: Sequence[Recording]) -> tuple[Recording, ...]:
 
 
 def _goes_on(a: Recording, b: Recording) -> bool:
-    """Whether a part of a run knows that it begins where another one ends, on the same machine."""
+    """Whether `b` is known to begin where `a` ends, as parts of one run of the same machine."""
     before = b.continues
     if before is None or a.signals.keys() != b.signals.keys():
         return False
     if any(getattr(a, n) != getattr(b, n) for n in _OF_ONE_MACHINE):
         return False
-    n = min(a.N, before.N)  # `a` may be joined already, and longer than what `b` knows
+    n = min(a.N, before.N)  # `a` may be joined already, and longer than the part that `b` continues
     ends = math.isclose(a.start + a.N * a.Ts, b.start, abs_tol=0.5 * a.Ts)
     return ends and np.array_equal(before.u[-n:], a.u[-n:]) and np.array_equal(before.y[-n:], a.y[-n:])
 
@@ -508,16 +509,16 @@ def _beginning(recording: Recording) -> Recording:
 
 
 def check_apart(fitted: Sequence[Recording], unseen: Sequence[Recording], purpose: str, reason: str) -> None:
-    """Refuses data that were fitted in the place of data that no fit has seen.
+    """Refuses held-out recordings that share samples with recordings of a fit.
 
     Args:
-        fitted: Recordings that a fit sees.
-        unseen: Those that it must not see.
-        purpose: What each of the two is for, such as "to fit and to validate".
-        reason: Why they must differ, and what to give instead.
+        fitted: Recordings that a fit uses.
+        unseen: Recordings that the fit must not use.
+        purpose: Purpose of the two groups, such as "to fit and to validate".
+        reason: Why the groups must differ, and what to give instead.
 
     Raises:
-        InputError: One of the first is one of the second, or both have samples of one measurement.
+        InputError: A recording is in both groups, or the groups share samples of one measurement.
     """
     for a in fitted:
         for b in unseen:
@@ -534,20 +535,20 @@ def check_apart(fitted: Sequence[Recording], unseen: Sequence[Recording], purpos
 
 
 SHORTEST_TO_FIT = 11
-"""Samples below which a recording does not show the noise of its sensors: the width of the local polynomials
-from which a fit estimates it."""
+"""Least number of samples from which a fit can estimate the sensor noise: the width of the local polynomials
+that it uses for this."""
 
 
 def listed(recordings: Any, name: str = "recordings", shortest: int = 1) -> tuple[Recording, ...]:
     """One recording, or several in any iterable, as a tuple.
 
     Args:
-        recordings: What was given.
-        name: Of the argument.
-        shortest: Samples that each must have.
+        recordings: The argument that was given.
+        name: Name of the argument.
+        shortest: Least number of samples of each recording.
 
     Raises:
-        InputError: None at all, anything else, or one that is too short.
+        InputError: There is no recording, an entry is no recording, or a recording is too short.
 
     >>> listed("run.csv", "train")
     Traceback (most recent call last):
@@ -583,12 +584,12 @@ def single(recording: Any, name: str = "recording", shortest: int = 1) -> Record
     """The one recording that was given, alone or in a list.
 
     Args:
-        recording: What was given.
-        name: Of the argument.
-        shortest: Samples that it must have.
+        recording: The argument that was given.
+        name: Name of the argument.
+        shortest: Least number of samples of the recording.
 
     Raises:
-        InputError: None or several, anything else, or one that is too short.
+        InputError: There is no recording or more than one, it is no recording, or it is too short.
     """
     found = listed(recording, name, shortest)
     if len(found) != 1:

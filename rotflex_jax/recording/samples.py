@@ -12,26 +12,26 @@ from jaxtyping import Float, Real
 from rotflex_jax.checks import entries, positive, real, shown
 from rotflex_jax.errors import InputError
 
-# Relative difference of two sampling periods that is rounding.
+# Relative difference of two sampling periods that counts as rounding.
 SAME_PERIOD = 1e-6
 # Longest step that resampling bridges, in median steps.
 LONGEST_STEP = 5.0
 
 
 def real_numbers(values: Any, label: str, where: str = "sample", first: int = 0) -> Real[np.ndarray, "..."]:
-    """An array of real numbers, text parsed strictly.
+    """An array of real numbers; text is parsed strictly.
 
     Args:
-        values: what was given.
-        label: first words of an error, such as "run.csv: column 'theta'".
-        where: what one entry is called.
+        values: the values that were given.
+        label: first words of an error message, such as "run.csv: column 'theta'".
+        where: word for one entry in an error message.
         first: number of the first entry.
 
     Returns:
-        The array, float32 where that was given, else float64 or whole numbers.
+        The array: numbers in the type in which they were given, text as float64.
 
     Raises:
-        InputError: ragged, complex, text that is no number, or no numbers at all.
+        InputError: the values are ragged, masked, complex, text that is no number, or no numbers.
     """
     try:
         array = np.asarray(values)
@@ -63,10 +63,10 @@ def real_numbers(values: Any, label: str, where: str = "sample", first: int = 0)
 
 
 def finite(x: Real[np.ndarray, " N"], label: str, where: str = "sample", first: int = 0) -> None:
-    """Refuses NaN and infinity, naming the first.
+    """Refuses NaN and infinity.
 
     Raises:
-        InputError: with the place of the first and the number of all.
+        InputError: with the place of the first such value and the number of all of them.
 
     >>> finite(np.array([0.0, np.nan, 1.0]), "Channel 'alpha'")
     Traceback (most recent call last):
@@ -86,10 +86,10 @@ cut the recording there, or record again, since nothing is filled in silently.
 def aligned(
     u: Real[np.ndarray, "..."], y: Real[np.ndarray, "..."]
 ) -> tuple[Float[np.ndarray, " N"], Float[np.ndarray, "N C"]]:
-    """Input and outputs in one precision, copied and read only.
+    """Input and outputs in one precision, copied and read-only.
 
     Raises:
-        InputError: other shapes, or lengths that differ.
+        InputError: a shape is not valid, or the lengths differ.
     """
     if u.ndim == 2 and u.shape[1] == 1:
         u = u[:, 0]
@@ -117,7 +117,7 @@ def sampling_period(Ts: Any, label: str = "Argument `Ts`") -> float:
     """The sampling period as a positive number [s].
 
     Raises:
-        InputError: it is not.
+        InputError: it is no positive number.
 
     >>> sampling_period("fast")
     Traceback (most recent call last):
@@ -138,18 +138,18 @@ but is 'fast'; give for instance 0.002.
 
 
 def of_one_period(periods: Iterable[float]) -> bool:
-    """Whether sampling periods [s] are the same, to rounding."""
+    """Whether sampling periods [s] are the same up to rounding."""
     found = list(periods)
     return max(found) / min(found) - 1 <= SAME_PERIOD
 
 
 def require_period(period: float, recorded: float, what: str) -> None:
-    """Refuses a recording of another sampling period than that of a sampled model.
+    """Refuses a recording whose sampling period differs from the period of a sampled model.
 
     Args:
-        period: For which the model holds [s].
+        period: Sampling period for which the model holds [s].
         recorded: Sampling period of the recording [s].
-        what: Which model holds for it, such as "The system holds".
+        what: First words of the error message, such as "The system holds".
 
     Raises:
         InputError: The two differ by more than rounding.
@@ -168,19 +168,19 @@ def require_period(period: float, recorded: float, what: str) -> None:
 
 
 def even_spacing(t: Real[np.ndarray, " N"], label: str, where: str = "sample", first: int = 0) -> float:
-    """The sampling period of time stamps that must be evenly spaced, each to 1 % of it.
+    """The sampling period of time stamps that must be evenly spaced, to 1 % of the period.
 
     Args:
         t: time stamps [s].
-        label: first words of an error.
-        where: what one entry is called.
+        label: first words of an error message.
+        where: word for one entry in an error message.
         first: number of the first entry.
 
     Returns:
         Sampling period [s].
 
     Raises:
-        InputError: equal or falling time stamps, a gap, or jitter, with the worst place.
+        InputError: time stamps are equal, decrease, have a gap or jitter; with the place.
 
     >>> even_spacing(np.arange(100) / 500, "Time")
     0.002
@@ -221,13 +221,13 @@ def even_spacing(t: Real[np.ndarray, " N"], label: str, where: str = "sample", f
             "than 1 %; pass resample='auto' for a uniform grid, or write the time with more digits."
         )
     mean = float(t[-1] - t[0]) / (len(t) - 1)
-    # Written times are rounded; the plain number within their error is the one that was set.
+    # Times in a file are rounded; a short number within their error is the period that was set.
     plain = float(f"{mean:.6g}")
     return plain if abs(plain - mean) < 1e-7 * mean else mean
 
 
 def initial_samples(n_init: int | None, N: int, Ts: float) -> int:
-    """How many samples a model may see: 0.2 s, at least ten, at most a quarter, if not given."""
+    """Samples at the start that a model may use; by default 0.2 s, but at least 10 and at most a quarter."""
     if n_init is None:
         return max(1, min(max(10, round(0.2 / Ts)), N // 4))
     given = real(n_init)
@@ -242,7 +242,7 @@ def initial_samples(n_init: int | None, N: int, Ts: float) -> int:
 def labels(
     channels: str | Sequence[str] | None, units: str | Sequence[str] | None, width: int
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Names and units of the outputs, by default those of the joint."""
+    """Names and units of the outputs; by default the names of the flexible joint, in radians."""
     default = ("theta", "alpha")[:width] if width <= 2 else ()
     names = _tuple(default if channels is None else channels)
     each = _tuple(("rad",) * width if units is None else units)
@@ -266,7 +266,7 @@ def _tuple(words: Any) -> tuple[Any, ...]:
 def known_resolution(
     given: Mapping[str, float | None] | None, channels: Sequence[str]
 ) -> Mapping[str, float | None]:
-    """Channel -> quantisation step, each a positive number, or None for a channel without one."""
+    """Channel -> quantisation step, checked: a positive number, or None for a channel without a step."""
     if not (given is None or isinstance(given, Mapping)):
         raise InputError(
             f"Argument `resolution` must give the step of each channel, but is {shown(given)}; write for "
@@ -284,7 +284,7 @@ def known_resolution(
 
 
 def known_constants(given: Mapping[str, float] | None) -> Mapping[str, float]:
-    """Parameter name -> known value, each a finite number."""
+    """Parameter name -> known value, checked: each is a finite number."""
     found = {}
     if not (given is None or isinstance(given, Mapping)):
         raise InputError(
@@ -306,7 +306,7 @@ _UNIT_BEHIND = re.compile(r"(.*\S)\s*[\[(]\s*([^\[\]()]*[^\W\d][^\[\]()]*?|°)\s
 
 
 def name_and_unit(name: str) -> tuple[str, str]:
-    """The name of a column or a signal and the unit in brackets behind it.
+    """The name of a column or a signal, and the unit in brackets after it.
 
     >>> name_and_unit("Theta [deg]"), name_and_unit("log[0]"), name_and_unit("u")
     (('Theta', 'deg'), ('log[0]', ''), ('u', ''))
@@ -318,15 +318,15 @@ def name_and_unit(name: str) -> tuple[str, str]:
 def known_signals(
     given: Mapping[str, Any] | None, u: Float[np.ndarray, " N"], taken: Sequence[str]
 ) -> Mapping[str, Float[np.ndarray, " N"]]:
-    """Signal name -> a value for each sample of the input, in its precision, copied and read only.
+    """Signal name -> a value for each sample of the input, in the precision of the input, read-only.
 
     Args:
-        given: What was given.
+        given: The argument that was given.
         u: Input.
         taken: Names of the input and of the outputs.
 
     Raises:
-        InputError: no mapping, a name that is none, or samples that are not those of the input.
+        InputError: it is no mapping, a name is not valid, or a signal does not have the length of the input.
 
     >>> known_signals({"base": [0.1, 0.2]}, np.zeros(3), ())
     Traceback (most recent call last):

@@ -1,6 +1,6 @@
-"""Smoothed signals and their derivatives by local polynomials, without the import of `scipy.signal`.
+"""Smoothed signals and their derivatives by local polynomials, without an import of `scipy.signal`.
 
-That import takes longer than a fit, and a search needs nothing else of it.
+That import takes longer than a fit, and a search needs nothing else from `scipy.signal`.
 """
 
 import math
@@ -12,15 +12,15 @@ from jaxtyping import Float
 def local_polynomial(
     width: int, degree: int, derivative: int = 0, Ts: float = 1.0
 ) -> Float[np.ndarray, "width width"]:
-    """Row k: weights of `width` samples that give a derivative of their polynomial at the k-th of them.
+    """Row k: weights of `width` samples that give a derivative of their polynomial at the k-th sample.
 
-    The polynomial of some degree is fitted by least squares. The middle row is the filter of Savitzky and
-    Golay; the others serve the ends of a signal.
+    The polynomial is fitted by least squares. The middle row is the filter of Savitzky and Golay; the other
+    rows are for the ends of a signal.
 
     Args:
         width: Odd number of samples, more than the degree.
-        degree: Of the polynomial.
-        derivative: Its order; 0 smooths.
+        degree: Degree of the polynomial.
+        derivative: Order of the derivative; 0 smooths.
         Ts: Sampling period [s].
 
     Source: A. Savitzky and M. J. E. Golay, Anal. Chem. 36, 1964.
@@ -39,13 +39,13 @@ def local_polynomial(
 def smoothed(
     y: Float[np.ndarray, " N"], width: int, degree: int, derivative: int = 0, Ts: float = 1.0
 ) -> Float[np.ndarray, " N"]:
-    """A derivative of the local polynomial about each sample; near the ends of the first and last `width`.
+    """A derivative of the local polynomial around each sample; near the ends, of the end polynomials.
 
     Args:
         y: At least `width` samples.
-        width: As in `local_polynomial`, as are the others.
-        degree: Of the polynomial.
-        derivative: Its order; 0 smooths.
+        width: Odd number of samples of each polynomial, more than the degree.
+        degree: Degree of the polynomial.
+        derivative: Order of the derivative; 0 smooths.
         Ts: Sampling period [s].
     """
     weights, half = local_polynomial(width, degree, derivative, Ts), width // 2

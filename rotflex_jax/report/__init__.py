@@ -1,4 +1,4 @@
-"""What a person reads of a search: one self-contained HTML page, its figures, and tables for a terminal."""
+"""Reports of a search: one self-contained HTML page, its figures, and tables for a terminal."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,13 +15,13 @@ __all__ = ["parameter_table", "summary_table", "write_report"]
 def write_report(
     discovery: "SearchResult", folder: str | Path, explanation: "Explanation | None" = None
 ) -> Path:
-    """Write `report.html` (self-contained) and `result.json` into a folder, which is created.
+    """Writes `report.html` (self-contained) and `result.json` into a folder, which is created if needed.
 
     Args:
-        discovery: What was found.
-        folder: Where to write; files of these names are replaced.
-        explanation: What else is shown, from `Discovery.explanation`; a learned torque goes into
-            `learned_torque.json` too.
+        discovery: Result of a search.
+        folder: Folder for the files; files with these names are replaced.
+        explanation: Further results that the report shows, from `Discovery.explanation`. A learned torque is
+            also written to `learned_torque.json`.
 
     Returns:
         Path of the HTML page.
@@ -29,6 +29,6 @@ def write_report(
     Raises:
         InputError: The folder is a file, or cannot be written to.
     """
-    from rotflex_jax.report.page import write  # matplotlib is loaded only where it draws
+    from rotflex_jax.report.page import write  # loads matplotlib, so only on request
 
     return write(discovery, Path(folder), explanation)

@@ -51,7 +51,7 @@ REPORTED_PACKAGES = ("rotflex_jax", "jax", "equinox", "optimistix", "numpy", "sc
 
 
 def content(discovery: SearchResult, explanation: Explanation) -> dict[str, Any]:
-    """What the template fills in; plain text that the template escapes."""
+    """Content of the template, as plain text that the template escapes."""
     labels, colours = stage_labels(discovery), stage_colours(len(discovery.stages))
     models = list(zip(labels, colours, strict=True))
     if discovery.final_fit:
@@ -97,9 +97,9 @@ def content(discovery: SearchResult, explanation: Explanation) -> dict[str, Any]
 
 
 def _tiles(discovery: SearchResult) -> list[dict[str, str]]:
-    """The error of each channel before and after, large: on test data, where there are any.
+    """Tiles with the error of each channel before and after the search, on test data if there are any.
 
-    After is the model to use: that of the final fit, where there is one and test data.
+    The error after the search is the error of the final model, or of the final fit if it was tested.
     """
     tiles, data, fit = [], "test" if discovery.test else "validation", discovery.final_fit
     first, last = (
@@ -133,7 +133,7 @@ TONES = {None: "muted", Grade.NOISE: "yes", Grade.NEAR: "warn", Grade.FAR: "bad"
 
 
 def tone(discovery: SearchResult) -> str:
-    """Class of the headline: what is unexplained is bad where much is left, and a warning near the noise."""
+    """Style class of the headline: an unexplained error is bad far above the noise, else a warning."""
     shown = discovery.verdict.shown.tone
     return "warn" if shown == "bad" and discovery.assessment.grade is not Grade.FAR else shown
 
@@ -163,7 +163,7 @@ def _round(discovery: SearchResult, k: int) -> dict[str, Any]:
 
 
 def _test_lines(explanation: Explanation) -> list[str]:
-    """What the tests of the last model's residuals say, in words."""
+    """Results of the residual tests of the last model, in words."""
     tests = explanation.tests.residuals if explanation.tests else {}
     if not tests:
         return []
@@ -172,7 +172,7 @@ def _test_lines(explanation: Explanation) -> list[str]:
 
 
 def _shown(estimate: Estimate) -> tuple[str, str]:
-    """Value and interval, or why there is none."""
+    """Value and 95 % interval of an estimate, or the reason why it has no interval."""
     value, interval = value_and_interval(estimate)
     if interval:
         return value, f"95 %: {interval}"
@@ -186,7 +186,7 @@ def _places(places: Sequence[Where]) -> list[dict[str, Any]]:
 
 
 def _later(found: Estimate, used: Estimate | None) -> str:
-    """What became of an estimate in the model to use, where it is another one there."""
+    """Value of an estimate in the model to use, in words, if it differs there; empty otherwise."""
     if used is None:
         return "not in the model to use"
     return f"{value_and_interval(used)[0]} in the model to use" if has_moved(found, used) else ""
@@ -266,7 +266,7 @@ def _version(package: str) -> str:
 
 
 def _learned_torque(discovery: SearchResult, learned: LearnedTorqueResult) -> dict[str, Any]:
-    """A learned torque in words: what it is worth and how it reads."""
+    """A learned torque in words: the change of the errors, and its formula."""
     falls, unit = [], learned.model.mechanism.units.unit
     for channel, read_in in channel_units(discovery).items():
         old, read = readable(learned.before.held_out_rmse_windows[channel], read_in)
@@ -291,7 +291,7 @@ def _learned_torque(discovery: SearchResult, learned: LearnedTorqueResult) -> di
 
 
 def write(discovery: SearchResult, folder: Path, explanation: Explanation | None = None) -> Path:
-    """Write `report.html`, `result.json` and a learned torque; returns the path of the page."""
+    """Writes `report.html`, `result.json` and a learned torque if there is one; returns the page's path."""
     explanation = explanation or Explanation()
     files = {"result.json": as_json(discovery.to_dict())}
     if explanation.learned is not None:
@@ -301,7 +301,7 @@ def write(discovery: SearchResult, folder: Path, explanation: Explanation | None
 
 
 def render(discovery: SearchResult, explanation: Explanation | None = None) -> str:
-    """The page as text, with what was computed for it."""
+    """The HTML page as text."""
     return fill_template(
         "rotflex_jax.report", "report.html.j2", content(discovery, explanation or Explanation())
     )

@@ -1,4 +1,4 @@
-"""The page of one model on one recording: free run, errors, tests of the residuals, frequency response."""
+"""HTML page of one model on one recording: free run, errors, residual tests, frequency response."""
 
 import dataclasses
 from pathlib import Path
@@ -23,22 +23,22 @@ from rotflex_jax.text.markup import as_json, fill_template, write_files
 from rotflex_jax.text.numbers import json_numbers, plain_number, readable, unit_text, value_and_interval
 from rotflex_jax.text.plotting import Picture, styled
 
-# The model's name in figures.
+# Name of the model in figures.
 NAME = "simulated"
 
 
 @dataclasses.dataclass(frozen=True)
 class Simulation:
-    """A free run with what is said of it.
+    """A free run of a model over a recording, with its tests.
 
     Attributes:
-        recording: What was measured.
-        model: What was simulated.
-        simulated: Its free run.
-        fit: Where the model comes from; None where it was taken as it is.
-        residuals: Tests of measured less simulated; None where a run diverges or is too short.
-        measured: Response of the measured outputs.
-        response: That of the run; None where it diverges.
+        recording: The recording.
+        model: The model.
+        simulated: Free run of the model.
+        fit: Fit from which the model comes; None if the model was not fitted.
+        residuals: Tests of measured less simulated; None if the run diverges or is too short.
+        measured: Frequency response of the measured outputs.
+        response: Frequency response of the free run; None if it diverges.
     """
 
     recording: Recording
@@ -66,13 +66,13 @@ class Simulation:
 def tested(
     recording: Recording, model: Model, simulated: Float[np.ndarray, "N C"], fit: Fit | None = None
 ) -> Simulation:
-    """A free run with its tests.
+    """Tests a free run.
 
     Args:
-        recording: What was measured.
-        model: What was simulated.
-        simulated: Its free run over the recording.
-        fit: Where the model comes from.
+        recording: The recording.
+        model: The model.
+        simulated: Free run of the model over the recording.
+        fit: Fit from which the model comes; None if the model was not fitted.
     """
     y, m, u = model.measured(recording).astype(float), recording.n_init, recording.u.astype(float)
     finite, residuals, response = bool(np.all(np.isfinite(simulated))), None, None
@@ -85,7 +85,7 @@ def tested(
 
 
 def write_simulation(simulation: Simulation, folder: str | Path) -> Path:
-    """Write `simulation.html` (self-contained) and `simulation.json` into a folder, which is created.
+    """Writes `simulation.html` (self-contained) and `simulation.json` into a folder, created if needed.
 
     Returns:
         Path of the HTML page.

@@ -8,13 +8,13 @@ from rotflex_jax.discover.tables import channel_headings, error_rows, noise_row,
 
 
 def summary_table(discovery: SearchResult) -> Table:
-    """Held-out errors from the baseline through each round, for `rich.print`.
+    """Table of the held-out errors of the baseline and after each round, for `rich.print`.
 
     Args:
-        discovery: What was found.
+        discovery: Result of a search.
 
     Returns:
-        A table; a notebook shows it by itself.
+        A table, which a notebook displays.
     """
     seconds = f"{discovery.baseline.window_seconds:g} s"
     table = Table(
@@ -39,13 +39,13 @@ def summary_table(discovery: SearchResult) -> Table:
 
 
 def parameter_table(discovery: SearchResult) -> Table:
-    """Parameters of the last stage, or of its final fit, with 95 % intervals, for `rich.print`.
+    """Table of the parameters of the final model, or of the final fit, with 95 % intervals, for `rich.print`.
 
     Args:
-        discovery: What was found.
+        discovery: Result of a search.
 
     Returns:
-        A table; a notebook shows it by itself.
+        A table, which a notebook displays.
     """
     table = Table(box=None, pad_edge=False, header_style="bold")
     table.add_column("parameter", no_wrap=True)

@@ -1,4 +1,4 @@
-"""The seed paper, run again: its experiment with every setting in sight, its figures, its page."""
+"""Reproduction of the seed paper: its experiment with all settings, its figures, and an HTML page."""
 
 from rotflex_jax.reproduce.experiment import Reproduction, reproduce
 from rotflex_jax.reproduce.settings import Settings

@@ -22,14 +22,14 @@ from rotflex_jax.reproduce.settings import Settings
 
 @dataclasses.dataclass(frozen=True)
 class Prediction:
-    """Step sizes and the convergence that theory predicts for them, before any run.
+    """Step sizes, and their convergence as predicted by theory before any run.
 
     Attributes:
-        eigenvalue: Of the direction in which the observed coefficient converges.
+        eigenvalue: Eigenvalue of the direction in which the observed coefficient converges.
         step_sizes: Degree -> step size.
         mu: Step size of each weight.
         settle: Iterations after which the mean of the coefficient is within 5 % of its final value.
-        stability: Margin to divergence, and excess error.
+        stability: Stability margin and excess error.
     """
 
     eigenvalue: float
@@ -42,16 +42,16 @@ class Prediction:
 def settling_eigenvalue(
     covariance: Float[np.ndarray, "P P"], degrees: Int[np.ndarray, " P"], index: int
 ) -> float:
-    """The eigenvalue that governs how fast one quadratic weight converges.
+    """The eigenvalue that determines how fast a quadratic weight converges.
 
     The constant converges fast and absorbs the mean of the products, so the covariance of the products about
-    their means counts. Of its eigenvectors the one with the largest share of the weight decides; with
-    white input of variance 1 that is 2 for a square and 1 for a product of two samples.
+    their means is decisive. The result is its eigenvalue for the eigenvector with the largest share of the
+    weight. With a white input of variance 1 it is 2 for a square and 1 for a product of two samples.
 
     Args:
         covariance: Second moments of the regressors.
         degrees: Degree of every regressor.
-        index: Of the regressor.
+        index: Index of the regressor that belongs to the weight.
 
     >>> R = np.array([[1.0, 1.0, 0.0], [1.0, 3.0, 0.0], [0.0, 0.0, 1.0]])
     >>> settling_eigenvalue(R, np.array([0, 2, 2]), 1), settling_eigenvalue(R, np.array([0, 2, 2]), 2)
@@ -64,21 +64,21 @@ def settling_eigenvalue(
         centred = centred - np.outer(mean, mean) / covariance[k, k]
     values, vectors = np.linalg.eigh(centred)
     share = vectors[pick.tolist().index(index)] ** 2
-    # Eigenvectors of nearly equal eigenvalues are arbitrary: their shares count together.
+    # Eigenvectors of nearly equal eigenvalues are arbitrary within their span, so their shares are added.
     alike = np.isclose(values[:, None], values[None, :], rtol=0.05)
     return float(values[np.argmax(alike @ share + 1e-9 * share)])
 
 
 def predict(s: Settings, degrees: Int[np.ndarray, " P"], moments: Moments, index: int) -> Prediction:
-    """Step sizes for `settle_at`, or the prediction for given ones.
+    """Step sizes with the predicted convergence; a quadratic step size that is not given follows `settle_at`.
 
         mu2 = ln 20 / (settle_at eigenvalue)
 
     Args:
         s: Settings `mu1`, `mu2`, `settle_at`.
-        degrees: Of the regressors.
-        moments: Of the regressors.
-        index: Regressor of the observed coefficient.
+        degrees: Degree of every regressor.
+        moments: Moments of the regressors.
+        index: Index of the observed coefficient.
     """
     eigenvalue = settling_eigenvalue(moments.R, degrees, index)
     mu2 = s.mu2 or settling_step_size(eigenvalue, s.settle_at)
@@ -88,12 +88,12 @@ def predict(s: Settings, degrees: Int[np.ndarray, " P"], moments: Moments, index
 
 
 PATH_POINTS = 400
-"""Points of a path that are stored."""
+"""Approximate number of points of a path that are stored."""
 MOST_PATH_NOISE = 0.2
-"""Standard deviation of a path about the exponential below which it counts as settling, as a share of its
-final value."""
+"""Largest standard deviation of a path about its exponential for which a settling time is given, as a share
+of the final value."""
 LEAST_T_VALUE = 4.0
-"""Standard errors by which a coefficient must differ from zero for a settling time to be given."""
+"""Least t-value of a coefficient for which a settling time is given."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -101,20 +101,21 @@ class Adaptation:
     """Result of the adaptive filter.
 
     Attributes:
-        model: With the last weights, frozen; None after a divergence.
+        model: Model with the last weights, frozen; None after a divergence.
         size: Number of weights.
-        prediction: Made before the run.
-        times: Iterations.
-        paths: Observed coefficient of every run.
-        mean_path: Its predicted mean.
-        target: Its final value by least squares over all runs.
-        settle: Iterations to 95 % of it, by an exponential through the mean of the runs; None where the
-            noise is too large.
-        crossed: First iteration at which the mean of the runs is within 5 % of the target.
-        symmetric: The coefficient where friction and dead zone are symmetric, if simulated.
+        prediction: Prediction made before the run.
+        times: Iterations at which the paths are stored.
+        paths: Observed coefficient in every run.
+        mean_path: Predicted mean of the observed coefficient.
+        target: Final value of the observed coefficient, the mean of the least-squares fits of all runs.
+        settle: Iterations to 95 % of the target, from an exponential through the mean of the runs; None if
+            the noise is too large.
+        crossed: First stored iteration at which the mean of the runs is within 5 % of the target.
+        symmetric: Observed coefficient for a machine with symmetric friction and dead zone; None on measured
+            data.
         online: A-priori errors of the last half of the run, relative to the variance (NMSE). Not an error
             of the model: the weights follow the data.
-        passes: How often the training recordings were used.
+        passes: Number of passes over the training recordings.
         status: "ok", or "diverged at sample k".
     """
 
@@ -138,7 +139,7 @@ def adapt(s: Settings, records: Records, progress: Callable[[str], None]) -> Ada
 
     Args:
         s: Settings.
-        records: For training.
+        records: Recordings, of which those for training are used.
         progress: Called with a line of text for every step.
     """
     series = Volterra(Delays(s.memory), order=2, constant=s.constant, layout=s.layout)
@@ -192,7 +193,7 @@ def adapt(s: Settings, records: Records, progress: Callable[[str], None]) -> Ada
 
 
 def watched_index(s: Settings, series: Volterra) -> int:
-    """Position of the coefficient of Fig. 9 among the weights."""
+    """Index of the coefficient of Fig. 9 among the weights."""
     one, two = s.coefficient
     kernels = [series.kernels(weights) for weights in np.eye(series.size)]
     found = [k for k, kernel in enumerate(kernels) if series.degrees[k] == 2 and kernel[2][one, two] != 0]
@@ -243,7 +244,10 @@ def _mean_path(
 
 
 def moments(s: Settings, basis: Any, records: Records) -> Moments:
-    """Of the regressors: from the spectrum of the input alone, or from a measured input."""
+    """Moments of the regressors: exact ones from the filter of the input, or sample moments.
+
+    Sample moments are used for measured recordings and for transformed regressors.
+    """
     if records.measured or s.transform != "none":
         return Moments.of_regressors(_stacked(basis, records.train, records.channel)[0])
     lags = np.arange(s.memory)
@@ -252,7 +256,7 @@ def moments(s: Settings, basis: Any, records: Records) -> Moments:
 
 
 def online_nmse(errors: Float[np.ndarray, " N"], y: Float[np.ndarray, " N"]) -> float:
-    """Of the a-priori errors, over the last half."""
+    """NMSE of the a-priori errors over the last half of a run; NaN after a divergence."""
     half = len(y) // 2
     if not np.all(np.isfinite(errors)):
         return float("nan")
@@ -262,12 +266,12 @@ def online_nmse(errors: Float[np.ndarray, " N"], y: Float[np.ndarray, " N"]) -> 
 def settling(
     times: Real[np.ndarray, " K"], path: Float[np.ndarray, " K"], target: float
 ) -> tuple[float | None, int | None]:
-    """Iterations to 95 % of the target: of an exponential through the path, and of the path itself.
+    """Iterations to 95 % of the target, from an exponential through the path and from the path itself.
 
         path ~ target (1 - exp(-t / tau)),  settled at ln(20) tau
 
-    The exponential averages over the gradient noise. There is no settling time where the noise is a fifth of
-    the target or more, or where the path is still far from it.
+    The exponential averages over the gradient noise. The first result is None if the noise is a fifth of the
+    target or more, or if the path is shorter than 2 tau.
 
     >>> t = np.arange(0.0, 5000.0, 10.0)
     >>> settle, crossed = settling(t, 2.0 * (1 - np.exp(-t / 1000.0)), 2.0)
@@ -276,7 +280,7 @@ def settling(
     """
     from scipy.optimize import minimize_scalar  # takes long to import
 
-    if not target or not np.all(np.abs(path) < 100 * np.abs(target)):  # noise, or a filter that diverges
+    if not target or not np.all(np.abs(path) < 100 * np.abs(target)):  # no target, or a filter that diverged
         return None, None
     share = path / target
     inside = np.flatnonzero(np.abs(share - 1) < 0.05)

@@ -1,4 +1,4 @@
-"""Section 5 of the paper as a whole: record, adapt, freeze the weights, evaluate, apply a pulse."""
+"""The experiment of section 5 of the paper: record, adapt, freeze the weights, evaluate, apply a pulse."""
 
 import dataclasses
 import time
@@ -21,18 +21,18 @@ from rotflex_jax.reproduce.records import Records
 from rotflex_jax.reproduce.settings import Settings, linear_joint, machine, machine_rows, symmetric_twin
 
 STEP_SIZES = {0: 1e-2, 1: 1e-2, 2: 2e-4}
-"""By degree: about those of the experiment itself."""
+"""Degree -> step size, approximately as in the experiment itself."""
 
 
 @dataclasses.dataclass(frozen=True)
 class ShortMemoryErrors:
-    """Three errors of one model class, relative to the variance of the output.
+    """Three errors of one model class, relative to the variance of the output (NMSE).
 
     Attributes:
         Ts: Sampling interval [s].
-        online: A-priori errors of LMS over the last half of its run.
-        frozen: Its last weights on other data.
-        least_squares: Least squares on the same data.
+        online: A-priori errors of LMS over the last half of the training data.
+        frozen: Error of the last weights of LMS on evaluation data.
+        least_squares: Error of the least-squares weights on evaluation data.
     """
 
     Ts: float
@@ -42,12 +42,12 @@ class ShortMemoryErrors:
 
 
 def short_memory_errors(s: Settings, Ts: float = 1e-3, N: int = 15000) -> ShortMemoryErrors:
-    """Online, frozen and least-squares error where the memory is far too short.
+    """Online, frozen and least-squares error at a sampling interval for which the memory is far too short.
 
     Args:
         s: Settings of the machine, the input and the memory.
-        Ts: Sampling interval instead of theirs [s].
-        N: Samples for training, and as many for the evaluation.
+        Ts: Sampling interval, which replaces the interval of the settings [s].
+        N: Number of samples for training, and of samples for evaluation.
     """
     fast = dataclasses.replace(s, Ts=Ts, filter="ar1")
     u = sources.filtered_noise(fast, 2 * N, np.random.default_rng(s.seed))
@@ -73,13 +73,13 @@ class Reproduction:
     """The experiment and its results.
 
     Attributes:
-        settings: Of this run.
-        records: For training and for the evaluation.
+        settings: Settings of this run.
+        records: Recordings for training and evaluation.
         adaptation: Result of the paper's algorithm.
-        rows: Every model, with its errors on other data than it was fitted to.
-        short_memory: Online and frozen error where the memory is too short; None on measured data.
-        kernels: Kernels of the machine's equations beside those from data; None on measured data.
-        elapsed_s: Time it took [s].
+        rows: All models, with their errors on data that they were not fitted to.
+        short_memory: Errors with a memory that is too short; None on measured data.
+        kernels: Kernels of the machine's equations and kernels from data; None on measured data.
+        elapsed_s: Computing time [s].
     """
 
     settings: Settings
@@ -91,16 +91,16 @@ class Reproduction:
     elapsed_s: float
 
     def row(self, name: str) -> EvaluatedModel:
-        """A model by name."""
+        """The model with a name."""
         return next(row for row in self.rows if row.name == name)
 
     def setting_rows(self) -> list[dict[str, Any]]:
-        """Settings with source and reason; the numbers of a simulated machine after them."""
+        """Rows of the settings with source and reason, then of the parameters of a simulated machine."""
         rows = self.settings.rows()
         return rows if self.records.measured else rows + machine_rows(self.settings)
 
     def to_dict(self) -> dict[str, Any]:
-        """For scripts: settings with their sources, prediction and measurement, table."""
+        """Settings with sources, predicted and measured convergence, and errors, as plain JSON types."""
         a = self.adaptation
         return {
             "schema": 1,
@@ -155,23 +155,23 @@ def reproduce(
     channel: str | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> Reproduction:
-    """Run the paper's experiment, simulated or on recordings.
+    """Runs the paper's experiment, simulated or on recordings.
 
     Args:
-        settings: Defaults if None.
-        train: Recordings for training; None simulates them.
-        test: Recordings for the evaluation.
-        joint: Linear model to compare with on recordings; the paper's joint if None.
-        channel: Output to identify; the deflection if None.
+        settings: Settings; the defaults if None.
+        train: Recordings for training; if None, all recordings are simulated.
+        test: Recordings for evaluation.
+        joint: Linear model for comparison on recordings; the paper's joint if None.
+        channel: Output to identify; if None, the deflection, or the first output of recordings without it.
         progress: Called with a line of text for every step.
 
     Raises:
-        InputError: Recordings that do not fit the settings.
+        InputError: The recordings do not fit the settings.
     """
     start, s = time.perf_counter(), settings or Settings()
     progress = progress or (lambda step: None)
     if train is None:
-        machine(s)  # a parameter that it does not have is refused before any work
+        machine(s)  # refuses an unknown parameter before any computation
         progress("simulating the machine")
         data = sources.simulated(s)
     else:

@@ -1,4 +1,4 @@
-"""The figures of the paper, drawn again."""
+"""The figures of the paper, drawn from the results of the reproduction."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -17,10 +17,10 @@ from rotflex_jax.text.colours import BASELINE, FINAL, FURTHER, HIGHLIGHT, INK, M
 from rotflex_jax.text.numbers import readable
 from rotflex_jax.text.plotting import FigureRegistry, blank, legend_above, plain_ticks
 
-# So much of a signal is drawn [s].
+# Length of the part of a signal that is drawn [s].
 SIGNAL_SECONDS = 20.0
 
-# Dashes and darkness distinguish these too, so that a page in grey stays readable.
+# Lines also differ in dashes and darkness, so that a page printed in grey stays readable.
 AMBER, VIOLET = FURTHER[:2]
 
 FIGURES = FigureRegistry()
@@ -28,7 +28,7 @@ FIGURES = FigureRegistry()
 
 @dataclasses.dataclass(frozen=True)
 class LineStyle:
-    """How a model is drawn."""
+    """Style of the line of a model."""
 
     colour: str
     dashes: object
@@ -54,7 +54,7 @@ def orthonormal_row(result: Reproduction) -> str:
 
 
 def readable_unit(result: Reproduction) -> tuple[float, str]:
-    """Factor and unit in which people read the output."""
+    """Factor and unit for the display of the output, such as degrees for an angle."""
     return readable(1.0, result.records.unit)
 
 
@@ -155,7 +155,7 @@ def _span_caption(result: Reproduction) -> str:
     description="Least error of a linear model over the sampling interval.",
 )
 def figure_span(result: Reproduction) -> Figure:
-    """Least error of any linear model with this memory, over the sampling interval."""
+    """Least error of any linear model with the memory of the settings, over the sampling interval."""
     s, joint = result.settings, result.records.joint
     intervals = np.geomspace(1e-3, 0.2, 70)
     figure = blank(10.0, 2.9)
@@ -231,7 +231,7 @@ def _coefficient_caption(result: Reproduction) -> str:
     description="A quadratic coefficient over the iterations of LMS.",
 )
 def figure_9(result: Reproduction) -> Figure:
-    """The watched coefficient: runs, their mean, the prediction; beside it a symmetric machine."""
+    """The observed coefficient: runs, their mean and the prediction, and a run with a symmetric machine."""
     a, unit = result.adaptation, f"10⁻³ {result.records.unit}/V²"
     twin = a.symmetric
     figure = blank(10.0, 3.6)
@@ -301,7 +301,7 @@ def _mark(ax: Axes, x: float, text: str, height: float) -> None:
     description="Bars of the online error, of the frozen weights and of least squares.",
 )
 def figure_trap(result: Reproduction) -> Figure | None:
-    """Online, frozen and least-squares error where the memory is far too short."""
+    """Online, frozen and least-squares error with a memory that is far too short."""
     t = result.short_memory
     if t is None:
         return None
@@ -353,7 +353,7 @@ def _plateau(result: Reproduction) -> str:
     description="Output of the quadratic model and of identified linear models.",
 )
 def figure_10(result: Reproduction) -> Figure:
-    """The paper's model on the pulse (or on held-out data), beside identified linear ones."""
+    """The paper's model and identified linear models on the pulses, or on held-out data without pulses."""
     M = f"M={result.settings.memory}"
     return _compared(result, (f"{M} quadratic, LMS", f"{M} linear", orthonormal_row(result)))
 
@@ -373,7 +373,7 @@ def _linearised_caption(result: Reproduction) -> str:
     description="Output of the linearised joint and of an identified linear model.",
 )
 def figure_11(result: Reproduction) -> Figure:
-    """The linearised joint on the same, beside an identified linear model."""
+    """The linearised joint and an identified linear model on the pulses, or on held-out data."""
     return _compared(result, ("linearised joint", orthonormal_row(result)))
 
 
@@ -433,7 +433,7 @@ def _on_held_out(result: Reproduction, rows: Sequence[EvaluatedModel]) -> Figure
 def interleaved(
     result: Reproduction, outputs: Sequence[Real[np.ndarray, "_"]]
 ) -> tuple[Real[np.ndarray, " N"], Real[np.ndarray, " N"]]:
-    """Time and output of the first held-out recording, its thinned-out records put together again."""
+    """Time and output of the first held-out recording, put together from its decimated recordings."""
     parts = result.records.test[: result.records.phases]
     t = np.concatenate([r.t[r.n_init :] for r in parts])
     y = np.concatenate([y[r.n_init :] for r, y in zip(parts, outputs, strict=False)])
@@ -450,6 +450,6 @@ def interleaved(
     description="First and second kernel of the equations and of the data, and their difference.",
 )
 def figure_kernels(result: Reproduction) -> Figure | None:
-    """Kernels of the machine's equations beside those identified from its data."""
+    """Kernels of the machine's equations, and kernels identified from its data."""
     b = result.kernels
     return None if b is None else kernel_figure(b.physics, b.data, names=("physics", "data"))

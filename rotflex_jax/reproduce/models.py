@@ -1,4 +1,4 @@
-"""The models side by side: linearised, identified linear, the paper's, richer ones, grey box."""
+"""The models that are compared: linearised, identified linear, the paper's, richer ones, grey box."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -39,9 +39,16 @@ def impulse_response(joint: Mechanism, Ts: float, seconds: float = 1.2) -> Float
 def least_nmse(
     s: Settings, joint: Mechanism, intervals: Float[np.ndarray, " K"], *, white: bool = False
 ) -> Float[np.ndarray, " K"]:
-    """Least NMSE at several sampling intervals [s], for noise below the cutoff or white."""
+    """Least NMSE of a linear model at several sampling intervals [s].
+
+    Args:
+        s: Settings `memory` and `cutoff`.
+        joint: Plant, whose linear part is used.
+        intervals: Sampling intervals [s].
+        white: Whether the input is white; otherwise it is first-order noise with the cutoff frequency.
+    """
     responses = [impulse_response(joint, float(Ts)) for Ts in intervals]
-    length = max(map(len, responses))  # one for all, so that one thing is compiled
+    length = max(map(len, responses))  # one length for all, so that the program is compiled once
     found = []
     for Ts, h in zip(intervals, responses, strict=True):
         a = 0.0 if white else float(np.exp(-2 * np.pi * s.cutoff * Ts))
@@ -51,7 +58,7 @@ def least_nmse(
 
 
 KERNEL_SAMPLES = 4000
-"""Samples of the training recording over which the kernels of the equations are averaged."""
+"""Number of samples of the training recording over which kernels of the equations are averaged."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,10 +66,10 @@ class KernelComparison:
     """Kernels of the machine and kernels from its data.
 
     Attributes:
-        physics: By differentiating the simulator, averaged over the input.
-        data: By least squares of the quadratic model.
-        effects: Contribution of each effect of the machine to the kernels; None where the machine cannot
-            be simulated without one of them.
+        physics: Kernels from derivatives of the simulator, averaged over the input.
+        data: Kernels from a least-squares fit of the quadratic model.
+        effects: Contribution of each effect of the machine to the kernels; None if the machine cannot be
+            simulated without one of them.
     """
 
     physics: Kernels
@@ -75,29 +82,29 @@ class KernelComparison:
 
 
 def compare_kernels(s: Settings, records: Records) -> KernelComparison | None:
-    """Kernels of a simulated machine and of its data; None where no equations are known.
+    """Kernels of a simulated machine and kernels from its data; None for measured recordings.
 
     Args:
         s: Settings.
-        records: To learn from.
+        records: Recordings, of which the first one for training is used.
     """
     if records.machine is None:
         return None
     first = records.train[0]
     part = first.slice(0, min(KERNEL_SAMPLES, first.N))
-    # Coarser than the recording itself, but a per mille is accurate enough for kernels.
+    # The step is longer than in the simulation of the recording; an error of a per mille is acceptable here.
     model = Model(records.machine, Exponential(substeps=max(1, round(s.Ts / 5e-3))))
     fit = least_squares(Volterra(Delays(s.memory)), first, records.channel)
     physics = average_kernels(model, part, records.channel, s.memory)
     try:
         effects = effect_kernels(model, part, records.channel, s.memory)
-    except InputError:  # a softening spring without the effect that hardens it is unstable
+    except InputError:  # unstable without one effect, such as a softening spring without the hardening part
         effects = None
     return KernelComparison(physics, identified_kernels(fit, s.memory, first), effects)
 
 
 POLE_SAMPLES = 4000
-"""Samples of the training recording in which poles are searched."""
+"""Number of samples of the training recording that the search for poles uses."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -105,14 +112,14 @@ class EvaluatedModel:
     """One model and its errors on data that it was not fitted to.
 
     Attributes:
-        name: Short, for tables.
-        about: What it is and how it was identified.
+        name: Short name for tables.
+        about: Description of the model and of its identification.
         size: Number of parameters fitted to data.
         held_out: Error on the evaluation data, relative to the variance (NMSE).
-        pulses: The same on each pulse.
-        y_hat: Output on every recording of them.
-        pulse_hat: Output on each pulse.
-        series: The model, where it is a series.
+        pulses: Error on each pulse, relative to the variance (NMSE).
+        y_hat: Output of the model on every evaluation recording.
+        pulse_hat: Output of the model on each pulse.
+        series: The model if it is a series, else None.
     """
 
     name: str
@@ -126,7 +133,7 @@ class EvaluatedModel:
 
 
 Outputs = Sequence[Float[np.ndarray, " _"]]
-"""An output of several recordings."""
+"""One output of several recordings."""
 
 
 def nmse(y: Outputs, y_hat: Outputs) -> float:
@@ -150,7 +157,7 @@ def evaluate_model(
 ) -> EvaluatedModel:
     """Evaluates a model on the evaluation recordings and the pulses."""
     if outputs is None:
-        # A filter that diverged makes no model, and has no output.
+        # A filter that diverged gives no model; its output is NaN.
         run = (lambda r: series.simulate(r)[:, 0]) if series else (lambda r: np.full(r.N, np.nan))
         outputs = [run(r) for r in records.test], [run(p.recording) for p in records.pulses]
     held, pulses = (tuple(np.asarray(y) for y in part) for part in outputs)
@@ -176,7 +183,7 @@ def linearised(records: Records) -> EvaluatedModel:
 
 
 def poles(joint: Mechanism) -> list[complex]:
-    """Continuous-time poles of the deflection [1/s]: those of the joint without the free rotation."""
+    """Continuous-time poles of the deflection [1/s]: all poles of the joint except the free rotation."""
     found = np.linalg.eigvals(linearise(joint).A)
     return [complex(p) for p in found if abs(p) > 1e-6 * np.max(np.abs(found))]
 
@@ -216,19 +223,19 @@ def _fitted(records: Records, basis: Volterra, name: str, about: str, extra: int
 
 
 FIT_SECONDS = 40.0
-"""Part of each training recording that the grey-box fit uses [s]; more is not needed."""
+"""Length of the part of each training recording that the grey-box fit uses [s]; more is not needed."""
 LONGEST_FIT_STEP = 5e-3
-"""Longest step of its simulation [s]."""
+"""Longest step of the simulation in the grey-box fit [s]."""
 
 
 def grey_box(records: Records, progress: Callable[[str], None]) -> EvaluatedModel | None:
-    """The linear joint with dry friction at hub and joint, dead zone and offset, fitted in free run.
+    """The linear joint with dry friction at hub and joint, dead zone and offset, fitted in free runs.
 
-    It starts from the listed constants and a little friction, and takes about half a minute. None where
-    the recordings lack an output of the joint.
+    The fit starts from the listed constants and a little friction, and takes about half a minute. The dead
+    zone is left out on measured recordings. The result is None if recordings lack an output of the joint.
 
     Args:
-        records: Both outputs are fitted, one is evaluated.
+        records: Recordings. All outputs of the joint are fitted, one is evaluated.
         progress: Called with a line of text for every step.
     """
     train, test = records.whole
@@ -257,12 +264,12 @@ def with_friction(joint: Mechanism, *, dead_zone: bool) -> Mechanism:
     """A linear joint with a little dry friction and an offset, as the start of a fit.
 
     Args:
-        joint: Linear.
-        dead_zone: Whether there is a dead zone too.
+        joint: The linear joint.
+        dead_zone: Whether to add a dead zone too.
     """
     for effect in (Coulomb("hub", level=0.01), Coulomb("joint", level=0.001), VoltageOffset(offset=0.0)):
         joint = joint + effect
     if not dead_zone:
         return joint
-    # An offset shifts the dead zone: with both of its ends free, one of three parameters is redundant.
+    # An offset shifts the dead zone, so one of the offset and the two ends of the dead zone is redundant.
     return (joint + DeadZone(positive=0.05, negative=0.05)).trust("input.dead_zone.negative")

@@ -1,4 +1,4 @@
-"""What `rotflex reproduce` leaves behind: sentences that quote results, a page, figures, and JSON."""
+"""Output of `rotflex reproduce`: sentences with the results, an HTML page, figures, and JSON."""
 
 import io
 import math
@@ -16,7 +16,7 @@ from rotflex_jax.text.plotting import Picture, by_section
 
 
 def number(value: float, count: int = 3) -> str:
-    """A number for people; a dash where there is none.
+    """A number as text; a dash if it is not finite.
 
     >>> number(0.015234), number(7052.3, 4), number(float("nan"))
     ('0.0152', '7052', '–')
@@ -25,7 +25,7 @@ def number(value: float, count: int = 3) -> str:
 
 
 def headline(result: Reproduction) -> str:
-    """The page's title: what became of Figure 9."""
+    """Title of the page: the result for Figure 9."""
     a = result.adaptation
     if a.status != "ok":
         return f"LMS {a.status}"
@@ -37,7 +37,7 @@ def headline(result: Reproduction) -> str:
 
 
 def summary(result: Reproduction) -> str:
-    """Three sentences: the paper's model, the linear one beside it, what a kernel of degree 2 is worth."""
+    """Summary: the paper's model, the identified linear model, and the gain by a kernel of degree 2."""
     lms, linear, physical = (result.row(name).held_out for name in names(result))
     quadratic = result.row(f"M={result.settings.memory} quadratic").held_out
     paper = (
@@ -56,13 +56,13 @@ def summary(result: Reproduction) -> str:
 
 
 def names(result: Reproduction) -> tuple[str, str, str]:
-    """The paper's model, the identified linear one, the linearised joint."""
+    """Names of the paper's model, of the identified linear model, and of the linearised joint."""
     M = f"M={result.settings.memory}"
     return f"{M} quadratic, LMS", f"{M} linear", "linearised joint"
 
 
 def online(result: Reproduction) -> list[str]:
-    """The a-priori error, and what it is not."""
+    """Sentences on the a-priori error, which is no error of a model."""
     a = result.adaptation
     if a.status != "ok":
         return [f"The filter {a.status}: its step sizes are too large for this input."]
@@ -91,7 +91,7 @@ def _sizes(result: Reproduction) -> str:
 
 
 def lessons(result: Reproduction) -> list[str]:
-    """What the table shows."""
+    """Sentences on the results in the table."""
     M, found = f"M={result.settings.memory}", []
     linear, quadratic, cubic = (
         result.row(f"{M} {word}").held_out for word in ("linear", "quadratic", "cubic")
@@ -118,7 +118,7 @@ def lessons(result: Reproduction) -> list[str]:
 
 
 def _best_linearised(result: Reproduction) -> list[PulseRun]:
-    """Pulses on which nothing beats the linearised joint."""
+    """Pulses on which no model is better than the linearised joint."""
     errors = zip(*(row.pulses for row in result.rows), strict=True)
     return [p for p, each in zip(result.records.pulses, errors, strict=True) if each[0] == min(each)]
 
@@ -143,7 +143,7 @@ def _seconds(result: Reproduction) -> str:
 
 
 def plateau(result: Reproduction) -> str:
-    """Where the model rests within a pulse, computed from its kernels."""
+    """Sentence on the steady output of the model within a pulse, computed from its kernels."""
     series = result.row(names(result)[0]).series
     if series is None or not result.records.pulses:
         return ""
@@ -163,11 +163,11 @@ DPI = 150
 
 
 def write(result: Reproduction, folder: Path) -> Path:
-    """Write `reproduce.html`, a PNG for every figure and `result.json`; returns the path of the page.
+    """Writes `reproduce.html`, a PNG for every figure and `result.json`; returns the path of the page.
 
     Args:
-        result: Of `reproduce`.
-        folder: Is created; files of these names are replaced.
+        result: Result of `reproduce`.
+        folder: Folder for the files, created if needed; files with these names are replaced.
 
     Raises:
         InputError: The folder is a file, or cannot be written to.
@@ -186,7 +186,7 @@ def _png(picture: Picture) -> bytes:
 
 
 def content(result: Reproduction, drawn: dict[str, Picture]) -> dict[str, Any]:
-    """What the template fills in; plain text that the template escapes."""
+    """Content of the template, as plain text that the template escapes."""
     s, records = result.settings, result.records
     sources = dict.fromkeys(r.source for r in (*records.train, *records.test) if r.source)
     return {
@@ -209,7 +209,7 @@ def content(result: Reproduction, drawn: dict[str, Picture]) -> dict[str, Any]:
 
 
 def headings(result: Reproduction) -> list[str]:
-    """Of the columns with errors."""
+    """Headings of the columns with errors."""
     return ["held out", *(f"pulse {p.height:+g} V".replace("-", "−") for p in result.records.pulses)]
 
 

@@ -1,8 +1,8 @@
 """Simulated flexible joints with known effects, on which a method can be tested.
 
-S0 is the paper's joint as listed: linear. The others add effects that a real joint may have. Only the joint
-itself comes from the paper: **every friction level, dead zone and spring term here is an
-assumption**, since nobody has published a measured one for this module.
+S0 is the paper's joint as listed, which is linear. The others add effects that a real joint may have. Only
+the joint itself comes from the paper: **every friction level, dead zone and spring term here is an
+assumption**, since no measured values have been published for this module.
 """
 
 import dataclasses
@@ -27,7 +27,7 @@ from rotflex_jax.joints.rotary_flexible import ARM_ANCHORS, HUB_ANCHORS, SIDE, S
 from rotflex_jax.mechanism import Exponential, Mechanism, simulate
 
 LONGEST_SIMULATION_STEP = 2.5e-4
-"""Longest step of the simulation [s]; the deflection after friction then errs by about 1e-5 (NMSE)."""
+"""Longest step of the simulation [s]; with friction, the error of the deflection is about 1e-5 (NMSE)."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,10 +35,10 @@ class Scenario:
     """Effects that are added to the paper's joint.
 
     Attributes:
-        about: In words, with values.
-        odd: Whether the negative voltage gives the negative motion: then all kernels of even degree are
+        about: The effects in words, with values.
+        odd: Whether the negative voltage gives the negative motion, so that all kernels of even degree are
             zero.
-        effects: The effects for a port of the arm's friction, "joint" or "arm".
+        effects: Function of the port of the arm's friction, "joint" or "arm", that returns the effects.
     """
 
     about: str
@@ -103,7 +103,7 @@ SCENARIOS: dict[str, Scenario] = {
         lambda at: (CubicSpring("joint", stiffness=60.0),),
     ),
 }
-"""Scenario by name."""
+"""Name -> scenario."""
 
 
 def plant(name: str, arm_friction: str = "joint", **numbers: Any) -> Mechanism:
@@ -112,14 +112,14 @@ def plant(name: str, arm_friction: str = "joint", **numbers: Any) -> Mechanism:
     Args:
         name: One of `SCENARIOS`.
         arm_friction: Port of the arm's friction: "joint", the bearing between hub and arm, or "arm",
-            against the table; the paper's "rotational speeds of the two rotating masses" leaves both.
-        **numbers: Of `joints.paper`, for instance `efficiency=0.621`.
+            against the table. The paper's "rotational speeds of the two rotating masses" allows both.
+        **numbers: Arguments of `joints.paper`, for instance `efficiency=0.621`.
 
     Returns:
         The paper's joint with the effects of the scenario, outputs `theta` and `alpha`.
 
     Raises:
-        InputError: No such scenario or port.
+        InputError: There is no such scenario or port.
 
     >>> [effect.name for effect in plant("S1").effects[-3:]]
     ['coulomb', 'coulomb', 'dead_zone']
@@ -147,11 +147,11 @@ def response(
     """Outputs from rest, in float64; sample k is the output at the start of `u[k]`.
 
     Args:
-        mechanism: From `plant`, or any other.
+        mechanism: Mechanism from `plant`, or any other.
         u: Voltage [V], held over each sample.
         Ts: Sampling period [s].
-        step: Longest step of the integration [s]; one step a sample simulates dry friction only
-            where the sampling is fast.
+        step: Longest step of the integration [s]; with dry friction, one step per sample is sufficient only
+            for fast sampling.
     """
     substeps = max(1, int(np.ceil(Ts / step - 1e-9)))
     return simulate(mechanism, np.asarray(u, float), Ts, solver=Exponential(substeps=substeps))
@@ -160,7 +160,7 @@ def response(
 def spring_series(
     left: int, right: int, hub_anchor: str, arm_anchor: int
 ) -> tuple[float, float, float, float]:
-    """The torque of two springs that may differ, about the angle at which they balance.
+    """Power series of the torque of two springs, which may differ, about their balance angle.
 
         tau = K a + K2 a^2 + K3 a^3,   a = alpha - alpha_0,   tau = dU/dalpha
 
@@ -169,9 +169,9 @@ def spring_series(
 
     Args:
         left: Spring 1, 2 or 3 on the side of positive angles.
-        right: The other one.
-        hub_anchor: "A", "B" or "C".
-        arm_anchor: 1, 2 or 3.
+        right: Spring 1, 2 or 3 on the other side.
+        hub_anchor: Anchor at the hub, "A", "B" or "C".
+        arm_anchor: Anchor at the arm, 1, 2 or 3.
 
     Returns:
         alpha_0 [rad], K [N m/rad], K2 [N m/rad^2], K3 [N m/rad^3].
@@ -193,7 +193,7 @@ def spring_series(
 def _torque(
     kit: SpringType, d: float, R: float, side: float, alpha: Inexact[np.ndarray, " K"]
 ) -> Inexact[np.ndarray, " K"]:
-    """Of one spring, from its length: dU/dalpha = force dlength/dalpha [N m]."""
+    """Torque of one spring, from its length: dU/dalpha = force dlength/dalpha [N m]."""
     along, aside = R * np.cos(alpha) - d, R * np.sin(alpha) - side
     length = np.sqrt(along**2 + aside**2)
     force = kit.preload + kit.rate * (length - kit.length)

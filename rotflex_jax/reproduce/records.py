@@ -24,13 +24,13 @@ def filtered_noise(s: Settings, N: int, seed: int | np.random.Generator) -> Floa
 
         u = sigma F(q) w / norm2(F),   w ~ N(0, 1)
 
-    The variance is that of the process, by the L2 norm of the filter's impulse response. Scaling by the
+    The variance of the process is scaled, by the L2 norm of the filter's impulse response. Scaling by the
     standard deviation of the sample would make the input depend on its future.
 
     Args:
         s: Settings `filter`, `cutoff`, `variance`, `Ts`.
-        N: Samples.
-        seed: Of the random numbers.
+        N: Number of samples.
+        seed: Seed of the random numbers.
 
     >>> u = filtered_noise(Settings(filter="fir"), 40000, 0)
     >>> round(float(np.var(u)), 1)
@@ -45,7 +45,7 @@ def filtered_noise(s: Settings, N: int, seed: int | np.random.Generator) -> Floa
 
 
 def impulse_response(s: Settings) -> Float[np.ndarray, " L"]:
-    """Of the filter, until it has decayed."""
+    """Impulse response of the filter, until it has decayed."""
     from scipy import signal  # takes long to import
 
     if s.filter == "ar1":
@@ -55,13 +55,13 @@ def impulse_response(s: Settings) -> Float[np.ndarray, " L"]:
         sections = np.asarray(signal.butter(BUTTERWORTH_ORDER, s.cutoff, fs=1 / s.Ts, output="sos"))
         radius = max(float(np.max(np.abs(np.roots(section[3:])))) for section in sections)
         return np.asarray(signal.sosfilt(sections, np.eye(1, _length(radius))[0]))
-    # Long enough that the window, and not the cut, shapes the band.
+    # So many taps that the window determines the pass band, not the truncation.
     taps = 2 * max(1, round(1.0 / (s.cutoff * s.Ts))) + 1
     return np.asarray(signal.firwin(taps, min(s.cutoff, 0.499 / s.Ts), fs=1 / s.Ts))
 
 
 def autocovariance(s: Settings, lags: int) -> Float[np.ndarray, " {lags}"]:
-    """Of the input at the lags 0, 1, ... [V²], from the filter alone.
+    """Autocovariance of the input at the lags 0, 1, ... [V²], computed from the filter.
 
     >>> autocovariance(Settings(), 2).round(4)
     array([1.    , 0.0432])
@@ -78,12 +78,12 @@ def pulse(s: Settings, height: float) -> Float[np.ndarray, " N"]:
 
 
 def _length(radius: float) -> int:
-    """Samples after which a pole has fallen to 1e-12."""
+    """Number of samples after which the response of a pole has decayed to 1e-12."""
     return int(np.ceil(np.log(1e-12) / np.log(max(radius, 1e-9)))) + 2
 
 
 MEMORY_SECONDS = 0.4
-"""Memory of the joint [s]; where a recording starts in motion, errors count only after it."""
+"""Memory of the joint [s]; errors are counted only after it, since a recording may start in motion."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -91,17 +91,17 @@ class Records:
     """Recordings of one sampling interval.
 
     Attributes:
-        train: For training; each with voltage and outputs.
-        test: For the evaluation.
+        train: Recordings for training, with voltage and outputs.
+        test: Recordings for evaluation.
         channel: The output that is identified.
-        unit: Of that output.
+        unit: Unit of the output that is identified.
         linearised: Output of the linear physical model on each recording in `test`.
-        joint: That model.
+        joint: The linear physical model.
         machine: The simulated machine; None for measured recordings.
-        repeats: More recordings like the first of `train`, with other inputs; none for measured ones.
-        pulses: Responses to the pulse and to its negative; none for measured ones.
-        phases: Decimated recordings per measured one.
-        whole: Recordings for training and for the evaluation before the decimation.
+        repeats: Further simulated recordings with other inputs, for repeated runs of the filter.
+        pulses: Simulated responses to the pulse and to its negative.
+        phases: Number of decimated recordings for each measured one.
+        whole: Recordings for training and for evaluation before the decimation.
     """
 
     train: tuple[Recording, ...]
@@ -132,12 +132,12 @@ class PulseRun:
     """One pulse test.
 
     Attributes:
-        height: Of the pulse [V].
+        height: Height of the pulse [V].
         recording: Voltage and response, one sample per `Ts`.
-        linearised: Response of the linearised model.
-        t: Times of the finely sampled response [s], from the start of the pulse.
-        alpha: The response at these times.
-        alpha_linearised: That of the linearised model.
+        linearised: Response of the linearised model, one sample per `Ts`.
+        t: Times of the finely sampled responses [s], from the start of the pulse.
+        alpha: Deflection of the machine at the times `t`.
+        alpha_linearised: Deflection of the linearised model at the times `t`.
     """
 
     height: float
@@ -176,13 +176,13 @@ def simulated(s: Settings) -> Records:
         machine=real,
         whole=((training[0],), (evaluation,)),
         repeats=tuple(training[1:]),
-        # A kernel of even degree responds equally to both, friction oppositely: one pulse is not enough.
+        # Both signs are needed: a kernel of even degree responds equally to them, friction oppositely.
         pulses=(_pulse(s, real, linear, s.pulse), _pulse(s, real, linear, -s.pulse)),
     )
 
 
 def symmetric(s: Settings, like: Recording) -> Recording:
-    """The same input to the machine with symmetric friction and dead zone alone."""
+    """Recording of the machine with symmetric friction and dead zone only, with the input of `like`."""
     return _record(s, symmetric_twin(s), like.u, np.random.default_rng(0))
 
 
@@ -195,7 +195,7 @@ def _record(
 
 
 def _plain(recording: Recording, s: Settings) -> Recording:
-    """With as many initial samples as the memory of model and machine needs."""
+    """The recording with `n_init` set to the memory of model and machine."""
     n_init = max(s.memory - 1, round(MEMORY_SECONDS / recording.Ts))
     return dataclasses.replace(recording, n_init=min(recording.N // 2, n_init), accept=ACCEPTABLE)
 
@@ -221,21 +221,21 @@ def from_measured(
     joint: Mechanism,
     channel: str | None = None,
 ) -> Records:
-    """Measured recordings at the sampling interval of the experiment.
+    """Measured recordings, decimated to the sampling interval of the experiment.
 
-    A recording is decimated to every k-th sample, starting at each of its first k samples: k recordings of
-    one sampling interval, no sample lost. Their information is nearly the same, so they do not replace a
-    longer recording.
+    Every k-th sample of a recording is taken, starting at each of its first k samples. This gives k
+    recordings with nearly the same information, which therefore do not replace a longer recording.
 
     Args:
-        s: Settings; those of the machine and the input are not used.
-        train: For training.
-        test: For the evaluation.
-        joint: Linear physical model to compare with; it must have the channel.
-        channel: Output to identify; alpha, or the only one, if None.
+        s: Settings; the settings of the machine and of the input are not used.
+        train: Recordings for training.
+        test: Recordings for evaluation.
+        joint: Linear physical model for comparison; it must have the channel.
+        channel: Output to identify; if None, alpha, or the first output of recordings without alpha.
 
     Raises:
-        InputError: No deflection, sampled more slowly than `Ts`, or too short.
+        InputError: The output is the hub angle theta or no output of `joint`, or a recording is too short, or
+            `Ts` is no multiple of its sampling period.
     """
     name = channel or ("alpha" if "alpha" in train[0].channels else train[0].channels[0])
     if name == "theta":
@@ -262,11 +262,11 @@ def from_measured(
 def decimate_like(
     parts: Sequence[Recording], outputs: Sequence[Float[np.ndarray, " _"]]
 ) -> tuple[Float[np.ndarray, " _"], ...]:
-    """Outputs of whole recordings, decimated as the recordings were.
+    """Outputs of whole recordings, decimated in the same way as the recordings.
 
     Args:
-        parts: Decimated recordings, those of one recording after the other.
-        outputs: One for each whole recording.
+        parts: All decimated recordings of the first whole recording, then of the next one, and so on.
+        outputs: One output for each whole recording.
     """
     k = len(parts) // len(outputs)
     return tuple(outputs[i // k][i % k :: k][: part.N] for i, part in enumerate(parts))
@@ -296,7 +296,7 @@ def _decimated(s: Settings, recording: Recording, name: str) -> list[Recording]:
             f"{where} has a part of {one.duration:.3g} s, but memory {s.memory} at a sampling interval of "
             f"{s.Ts:g} s needs {least * s.Ts:.3g} s; give a longer recording or a shorter Ts."
         )
-    # All of one length: the code compiled for one of them serves the others.
+    # All parts have the same length, so that they share one compiled program.
     N = (one.N - k + 1) // k * k
     return [_plain(one.slice(phase, phase + N).decimate(k), s) for phase in range(k)]
 

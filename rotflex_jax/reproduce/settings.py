@@ -1,8 +1,8 @@
 """Settings of the reproduced experiment, and the simulated machine with the source of each parameter.
 
-The paper gives the memory, the variance of the input, the pulse and a table of constants. It gives
-neither sampling interval, filter, step sizes nor number of samples, no friction and no dead zone, no
-sign convention, and no error as a number. All of these are settings here.
+The paper gives the memory, the variance of the input, the pulse and a table of constants. It gives no
+sampling interval, filter, step sizes or number of samples, no friction or dead zone, no sign convention, and
+no error as a number. All inputs that it does not give are settings here.
 """
 
 import dataclasses
@@ -16,7 +16,7 @@ from rotflex_jax.mechanism import Mechanism
 from rotflex_jax.reproduce.plants import SCENARIOS, plant
 
 PAPER, ASSUMPTION, NUMERICS = "paper", "assumption", "numerics"
-TINY = 1e-12  # least value of a positive setting
+TINY = 1e-12  # lower limit of a setting that must be positive
 
 
 def setting(
@@ -32,20 +32,24 @@ def setting(
     """A field of the settings.
 
     Args:
-        default: Value where none is given; its type is the type of the setting.
-        source: `PAPER`, `ASSUMPTION` or `NUMERICS`.
+        default: Default value; its type is the type of the setting.
+        source: Source of the default: `PAPER`, `ASSUMPTION` or `NUMERICS`.
         why: Reason for the default, in words.
-        unit: Of a number.
-        choices: All that may be given; empty for a number.
-        least: Smallest number; `TINY` for anything above zero.
-        most: Largest number.
+        unit: Unit of a number.
+        choices: All valid values; empty for a number.
+        least: Smallest valid number; `TINY` for any number above zero.
+        most: Largest valid number.
     """
     about = {"source": source, "why": why, "unit": unit, "choices": choices, "least": least, "most": most}
     return dataclasses.field(default=default, metadata=about)
 
 
 def checked(field: dataclasses.Field, value: Any) -> Any:
-    """The value in the type of the setting, or a refusal that says what is needed."""
+    """The value, converted to the type of the setting.
+
+    Raises:
+        InputError: The value is not valid; the message gives the valid range or choices.
+    """
     about, unit = field.metadata, field.metadata["unit"]
     default: Any = field.default
     if about["choices"]:
@@ -78,7 +82,7 @@ def _bounds(about: Mapping[str, Any]) -> str:
 
 
 def read(field: dataclasses.Field, value: Any) -> Any:
-    """Text as the value of a setting; text that cannot be read is returned for the check to refuse."""
+    """Text converted to the value of a setting; invalid text is unchanged, so that `checked` refuses it."""
     if not isinstance(value, str):
         return value
     try:
@@ -102,10 +106,10 @@ TRANSFORMS = ("none", "hermite", "gram_schmidt")
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """One run of the paper's experiment.
+    """Settings of one run of the paper's experiment.
 
     Raises:
-        InputError: A value that is no such number, out of range, or none of the choices.
+        InputError: A value has the wrong type, is out of range, or is none of the choices.
 
     >>> Settings().memory, Settings(Ts=0.05).Ts
     (5, 0.05)
@@ -247,9 +251,9 @@ class Settings:
         _consistent(self)
 
     def replace(self, changes: Mapping[str, Any]) -> "Settings":
-        """The same settings with some changed; text is read as the kind of value that is needed.
+        """The settings with some values changed; text is converted to the type of the setting.
 
-        A name with dots is that of a parameter of the machine and belongs to `plant`.
+        A name with dots is the name of a parameter of the machine and belongs to `plant`.
 
         >>> Settings().replace({"memory": "8", "coefficient": "1,2"}).coefficient
         (1, 2)
@@ -270,7 +274,7 @@ class Settings:
 
     @classmethod
     def table(cls) -> list[dict[str, Any]]:
-        """Every setting with default, unit, source ("paper", "assumption", "numerics") and reason."""
+        """All settings with default, unit, source ("paper", "assumption", "numerics") and reason."""
         return [
             {
                 "name": field.name,
@@ -290,7 +294,7 @@ class Settings:
 
 
 def _consistent(s: Settings) -> None:
-    """Checks of settings that depend on each other."""
+    """Checks settings that depend on each other, and brings `coefficient` and `plant` into standard form."""
     lags = s.coefficient
     if not (
         isinstance(lags, tuple | list)
@@ -332,28 +336,28 @@ ASSUMED_BECAUSE = {
 
 
 def linear_joint(s: Settings) -> Mechanism:
-    """The paper's joint, linear, with the constants that it lists."""
+    """The paper's linear joint, with the constants that the paper lists."""
     return plant("S0", efficiency=s.efficiency, inductance=s.inductance or None)
 
 
 def machine(s: Settings) -> Mechanism:
-    """The scenario's joint behind an amplifier that saturates, its parameters changed by `s.plant`.
+    """The joint of the scenario with an amplifier that saturates, and with the parameters in `s.plant`.
 
     Raises:
-        InputError: A parameter that this machine does not have, or out of its range.
+        InputError: A parameter is unknown or out of its range.
     """
     return _scenario(s).with_values(dict(s.plant))
 
 
 def symmetric_twin(s: Settings) -> Mechanism:
-    """The same with friction and dead zone that are equal in both directions, and nothing else."""
+    """The machine with symmetric friction and dead zone (scenario S1) instead of the scenario's effects."""
     twin = _scenario(dataclasses.replace(s, scenario=SYMMETRIC_SCENARIO))
     known = {name: value for name, value in s.plant if name in twin.parameter_names}
     return twin.with_values(known)
 
 
 def machine_rows(s: Settings) -> list[dict[str, Any]]:
-    """The machine's parameters as rows of the settings' table: the paper's constants, then what is assumed.
+    """Parameters of the machine as rows of the table of settings, with the paper or an assumption as source.
 
     >>> [row["name"] for row in machine_rows(Settings()) if row["source"] == "paper"][:2]
     ['hub.inertia.inertia', 'arm.inertia.inertia']

@@ -1,1 +1,1 @@
-"""What the package needs of JAX and of the machine: settings, threads, devices, compiled programs."""
+"""Use of JAX and of the machine: settings, threads, devices, compiled programs."""

@@ -1,14 +1,15 @@
 """`jax.jit` whose compiled programs are kept on disk, and compiler options for fast compilation.
 
-For a loop of many small operations the newer fusion emitters of XLA take as long as the rest of the compiler,
-and the loop runs no faster; so the older ones are used, where this XLA has the option. Nor is a program split
-for several compiler threads, which is more work in total: a search compiles several programs at once anyway.
+For a loop of many small operations, the newer fusion emitters of XLA take as long as the rest of the
+compiler, and the loop runs no faster. Therefore the older emitters are used, if this XLA has the option. A
+program is also not split for several compiler threads, which is more work in total: a search compiles several
+programs at once anyway.
 
-Tracing and compiling a mechanism takes seconds, running it milliseconds. So the compiled program is stored
-under a hash of everything that it depends on: the function, structure and solver, the shapes and types of the
-arrays, the source of this package, the versions and settings of JAX, the processor. Any difference gives
-another hash. A file carries the hash of its own content; one that is damaged is replaced. A stored program is
-machine code: its folder must not be shared with people who are not trusted.
+Tracing and compiling a mechanism takes seconds, running it milliseconds. Therefore the compiled program is
+stored under a hash of everything on which it depends: the function, structure and solver, the shapes and
+types of the arrays, the source of this package, the versions and settings of JAX, and the processor. Any
+difference gives another hash. A file contains the hash of its own content; a damaged file is replaced. A
+stored program is machine code: do not share its folder with people whom you do not trust.
 """
 
 import collections
@@ -44,40 +45,40 @@ from rotflex_jax.errors import InputError
 from rotflex_jax.runtime.xla import FAST_LOOPS_FLAG, cores, loops_are_fast, start_with_fast_loops
 
 _PACKAGE, _SOURCES = __name__.partition(".")[0], sorted(Path(__file__).parents[1].rglob("*.py"))
-# The source as loaded by this process; nothing is stored if a file has changed since about then.
+# The source that this process has loaded; nothing is stored if a file has changed since about that time.
 _LOADED, _ABOUT = time.time(), 10.0
 _SOURCE = hashlib.sha256(b"".join(file.read_bytes() for file in _SOURCES)).hexdigest()
-# Versions whose programs stay on disk, by source of the package, JAX with its settings, and processor.
+# Number of versions whose programs stay on disk: of the package, of JAX with its settings, of the processor.
 _VERSIONS = 6
-# Settings that a program is traced with and that a context may change.
+# Settings on which tracing depends and which a context may change.
 _SETTINGS = ("jax_enable_x64", "jax_default_matmul_precision")
-# Programs on disk: at most so many bytes of one version of the source, checked after so many are written.
+# Largest size [bytes] of the programs of one version on disk; how many programs are written between checks.
 MOST_BYTES, _CHECK_EVERY = 1_000_000_000, 64
 FOLDER_VARIABLE = "ROTFLEX_PROGRAMS"
-"""Environment variable with the folder of compiled programs; `off` keeps none."""
+"""Environment variable with the folder of compiled programs; with `off` no programs are kept."""
 # With these settings JAX does more at each call than run a program.
 _WATCHED = ("jax_disable_jit", "jax_debug_nans", "jax_debug_infs")
 _FOR_COMPILER = {"xla_cpu_use_fusion_emitters": False, "xla_cpu_parallel_codegen_split_count": 1}
 _programs: list["PersistentJit"] = []
-# Programs held in memory, that used last at the end: each takes some 14 MB, and loading it again 0.1 s. Where
-# there are more than the first number, those not used for longest are released down to the second.
+# Programs in memory, the most recently used at the end. Each takes about 14 MB, and 0.1 s to load it again.
+# If there are more than the first number, the least recently used are released, down to the second number.
 MOST_HELD, LEFT_HELD = 96, 72
 _recent: collections.OrderedDict["_Held", None] = collections.OrderedDict()
 _recent_lock = threading.Lock()
 _thread = threading.local()
 
 
-# Names of the files of programs that are used inside of each `loaded_ahead`, in order of their first use.
+# For each active `loaded_ahead`: names of the files of the programs used, in order of first use.
 _notes: list[dict[str, None]] = []
-# Programs that threads load from their files before they are needed.
+# Programs that threads are loading from files before they are needed.
 _coming: dict[Path, Future[Callable[..., Any] | None]] = {}
-# Lists by which programs were loaded ahead since programs were released last.
+# Lists that were used to load programs ahead, since programs were last released.
 _loaded_by: set[Path] = set()
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Held:
-    """A program in memory, where it is held, and its file if it has one."""
+    """A program in memory, the dictionary that holds it, and its file if it has one."""
 
     program: Callable[..., Any]
     place: dict[Any, "_Held"]
@@ -86,10 +87,10 @@ class _Held:
 
 
 class _Paused:
-    """While programs are made, by any thread, the search of cyclic garbage rests, if it was on.
+    """Switches the cyclic garbage collection off while any thread makes programs, if it was on.
 
-    Tracing makes so many objects that Python goes through all that the process holds again and again, and
-    meanwhile every thread waits: a tenth of the time of a first search.
+    Tracing makes so many objects that Python would scan all objects of the process again and again while
+    every thread waits, which takes a tenth of the time of a first search.
     """
 
     def __init__(self) -> None:
@@ -114,7 +115,7 @@ _without_garbage_collection = _Paused()
 
 @dataclasses.dataclass
 class _Storage:
-    """Where programs are kept: a folder that was chosen, the usual one, or none."""
+    """Where programs are kept: in a chosen folder, in the default folder, or not at all."""
 
     chosen: Path | None = None
     off: bool = False
@@ -128,16 +129,16 @@ _storage = _Storage()
 class PersistentJit:
     """`jax.jit` of a pure function whose first arguments are static; compiled programs are kept on disk.
 
-    Do not differentiate it or map over it: write the function that is to be traced inside of it. On other
-    devices than a CPU, and inside of other programs, it is `jax.jit` and nothing else.
+    Do not differentiate it or map over it: do this inside the function instead. On devices other than a CPU,
+    and inside of other programs, it is the same as `jax.jit`.
 
     Args:
-        function: Pure; a function of a module of this package that returns arrays, in tuples or named tuples.
-        static: How many of the first arguments are static.
-        optimisation_level: Of LLVM; what XLA takes by itself, 3, if None. At level 1 loops over samples run
-            as fast as at level 3 and compile in four fifths of the time; runs with slopes need level 3.
-            Level 0 is for large programs that run a few times: they compile in half of the time, and loops
-            take five to ten times as long.
+        function: Pure function of a module of this package that returns arrays, in tuples or named tuples.
+        static: Number of leading arguments that are static.
+        optimisation_level: Optimisation level of LLVM; the default of XLA, 3, if None. At level 1 loops over
+            samples run as fast as at level 3 and compile in four fifths of the time; runs with derivatives
+            need level 3. Level 0 is for large programs that run a few times: they compile in half of the
+            time, but loops take five to ten times as long.
     """
 
     def __init__(
@@ -149,12 +150,12 @@ class PersistentJit:
         self._static = static
         self._name = f"{function.__module__}.{function.__qualname__}"
         self._held: dict[Any, _Held] = {}
-        # Programs that a thread is making; another one that needs the same waits.
+        # Programs that a thread is making; other threads that need the same program wait.
         self._in_work: dict[Any, Future[None]] = {}
         _programs.append(self)
 
     def __call__(self, *arguments: Any) -> Any:
-        """What the function returns."""
+        """The result of the function."""
         start_with_fast_loops()
         known, leaves = arguments[: self._static], jax.tree.leaves(arguments[self._static :])
         if _plain() or any(isinstance(leaf, Tracer) for leaf in leaves):
@@ -174,14 +175,14 @@ class PersistentJit:
             file = self._file(known, tree, kinds, settings)
             program, result = self._made(known, tree, leaves, file)
             held = self._held[key] = _Held(program, self._held, key, file)
-        finally:  # where it failed, the next thread that waits makes it itself
+        finally:  # after a failure, the next waiting thread makes the program itself
             with _recent_lock:
                 self._in_work.pop(key).set_result(None)
         _used(held)
         return result
 
     def _awaited(self, key: Any) -> _Held | None:
-        """The program that another thread makes, once it is there; None where this thread is to make it."""
+        """The program that another thread makes, after a wait; None if this thread has to make it."""
         while True:
             with _recent_lock:
                 held, begun = self._held.get(key), self._in_work.get(key)
@@ -193,7 +194,7 @@ class PersistentJit:
             begun.result()
 
     def _file(self, known: tuple[Any, ...], tree: Any, kinds: Any, settings: Any) -> Path | None:
-        """Where the program of some arguments is kept; None where it is not."""
+        """The file of the program for these arguments; None if it is not kept on disk."""
         texts, folder = [static_key(x) for x in known], programs_folder()
         if folder is None or not all(texts) or not _unchanged():
             return None
@@ -201,11 +202,11 @@ class PersistentJit:
         return folder / _surroundings() / hashlib.sha256(name.encode()).hexdigest()
 
     def __len__(self) -> int:
-        """How many programs the process holds: one per structure and shapes of the arguments."""
+        """Number of programs in memory: one for each structure and shapes of the arguments."""
         return len(self._held) + self.jitted._cache_size()  # pyright: ignore[reportAttributeAccessIssue]
 
     def release_programs(self) -> None:
-        """Let go of the programs in memory."""
+        """Release the programs in memory."""
         with _recent_lock:
             for held in list(self._held.values()):
                 _recent.pop(held, None)
@@ -214,9 +215,9 @@ class PersistentJit:
     def _made(
         self, known: tuple[Any, ...], tree: Any, leaves: list[Any], file: Path | None
     ) -> tuple[Callable[..., Any], Any]:
-        """The program for arguments like these as a function of their leaves, and what it gives for them.
+        """The program for such arguments as a function of their leaves, and its result for these arguments.
 
-        It is kept in the file, if any.
+        The program is kept in the file, if there is one.
         """
 
         def flat(*leaves: Any) -> Any:
@@ -243,26 +244,26 @@ class PersistentJit:
 def persistent_jit(
     static: int, optimisation_level: int | None = None
 ) -> Callable[[Callable[..., Any]], PersistentJit]:
-    """Decorator: the function as a `PersistentJit`; arguments as there."""
+    """Decorator that makes a function a `PersistentJit`; arguments as in `PersistentJit`."""
     return lambda function: PersistentJit(function, static, optimisation_level)
 
 
 def make_ahead(function: Callable[..., Any], *arguments: Any) -> None:
-    """Call a function on a thread of its own, for the programs that it makes; its result is dropped.
+    """Call a function on a separate thread, only to make the programs that it needs; its result is dropped.
 
-    For programs that are needed soon, so that they are made while something else is waited for. Whoever needs
-    a program that is being made waits for it, and none is made twice. The call ends where the process holds
-    the first program that it needs. What goes wrong in it is not reported: it goes wrong again where the
-    result is needed.
+    For programs that are needed soon, so that they are made while the caller waits for something else. A
+    thread that needs a program in the making waits for it, so that no program is made twice. The call ends
+    early if the first program that it needs is already in memory. Its errors are not reported: they occur
+    again where the result is needed.
 
     Args:
-        function: Pure; it enters the precision that it needs by itself.
-        arguments: Of the function.
+        function: Pure function that sets the precision it needs by itself.
+        arguments: Arguments of the function.
     """
     start_with_fast_loops()
-    # A new thread has none of the settings of a context.
+    # A new thread does not inherit the settings of a context.
     if not _plain() and all(getattr(jax.config, s) is None for s in _SETTINGS[1:]):
-        # While the interpreter ends nothing more is taken: the main thread may end before the one that calls.
+        # An ending interpreter accepts no more work: the main thread may end before the calling thread.
         with contextlib.suppress(RuntimeError):
             _ahead().submit(_try, function, arguments)
 
@@ -275,7 +276,7 @@ def _try(function: Callable[..., Any], arguments: tuple[Any, ...]) -> None:
 
 
 class _NothingToMakeError(Exception):
-    """Ends a call that was made ahead."""
+    """Ends a call of `make_ahead` that has no program to make."""
 
 
 @functools.cache
@@ -285,14 +286,14 @@ def _ahead() -> ThreadPoolExecutor:
 
 @contextlib.contextmanager
 def loaded_ahead(*like: Any) -> Iterator[None]:
-    """Inside, programs that the last such block has used are loaded on threads before they are needed.
+    """Within this context, the programs that the last such block used are loaded on threads ahead of use.
 
-    Loading is machine code that is linked, outside of Python: it goes on beside the first fits. What is not
-    used in the end is let go of. Only the first such block of a process loads: later ones have in memory what
-    they share, and would load what searches of other processes have found.
+    Loading links machine code outside of Python, so it runs in parallel with the first fits. Programs that
+    are not used are released. Only the first such block of a process loads: later blocks find the shared
+    programs in memory, and would load programs of searches in other processes.
 
     Args:
-        like: Static values; blocks with equal ones count as alike.
+        like: Static values; blocks with equal values share a list of programs.
     """
     names, folder = [static_key(x) for x in like], programs_folder()
     if folder is None or not all(names) or not _unchanged():
@@ -330,7 +331,7 @@ def _load_ahead(files: list[Path]) -> None:
     if wanted:
         with _storage.lock:
             _prepare_loading()
-        with contextlib.suppress(RuntimeError):  # while the interpreter ends nothing more is taken
+        with contextlib.suppress(RuntimeError):  # an ending interpreter accepts no more work
             _coming.update({file: _loaders().submit(_stored_program, file) for file in wanted})
 
 
@@ -343,10 +344,10 @@ def keep_programs(folder: str | Path | bool = True) -> None:
     """Choose where compiled programs are kept, for this process.
 
     Args:
-        folder: The folder; True for the usual one, which `programs_folder` names; False for none.
+        folder: The folder; True for the default folder, which `programs_folder` returns; False to keep none.
 
     Raises:
-        InputError: Neither a path nor a truth value, or a path to a file.
+        InputError: The argument is neither a path nor a truth value, or it is the path of a file.
     """
     if not isinstance(folder, bool | str | Path) or folder == "":
         raise InputError(
@@ -363,9 +364,9 @@ def programs_folder() -> Path | None:
     """Folder of compiled programs.
 
     Returns:
-        What `keep_programs` or the environment variable `ROTFLEX_PROGRAMS` chose; else beside the code that
-        JAX stores, where the user has asked it to; else the user's cache folder. None where programs are not
-        kept.
+        The folder that `keep_programs` or the environment variable `ROTFLEX_PROGRAMS` chose; else a folder
+        within the compilation cache of JAX, if the user has enabled that; else a folder in the user's cache.
+        None if programs are not kept.
     """
     start_with_fast_loops()
     if _storage.off or len(jax.devices()) > 1 or jax.default_backend() != "cpu":
@@ -383,16 +384,16 @@ def programs_folder() -> Path | None:
 
 @dataclasses.dataclass(frozen=True)
 class Performance:
-    """What makes the programs of this package quick, as it is in this process; its text is one line.
+    """Settings of this process that determine the speed of compiled programs; `str` gives one line.
 
     Attributes:
-        folder: Where compiled programs are kept; None where they are not.
-        programs: How many are there, of this version of the package on this processor.
-        size: Their size [bytes].
-        fast_loops: Whether XLA compiles a loop over samples into one function; not where other JAX code
-            started it before, with other options.
-        cores: How many cores the process may use.
-        platform: Where JAX computes.
+        folder: Folder of compiled programs; None if they are not kept.
+        programs: Number of programs there, of this version of the package on this processor.
+        size: Size of these programs [bytes].
+        fast_loops: Whether XLA compiles a loop over samples into one function. False if other JAX code
+            started XLA before, with other options.
+        cores: Number of cores that the process may use.
+        platform: Platform on which JAX computes.
     """
 
     folder: Path | None
@@ -403,7 +404,7 @@ class Performance:
     platform: str
 
     def __str__(self) -> str:
-        """One line for a person."""
+        """One line for the user."""
         kept = "compiled programs are not kept"
         if self.folder:
             kept = f"{self.programs} compiled programs ({self.size / 1e6:.0f} MB) are kept in {self.folder}"
@@ -414,7 +415,7 @@ class Performance:
 
 
 def performance() -> Performance:
-    """What makes the programs of this package quick; see `Performance`.
+    """Settings of this process that determine the speed of compiled programs; see `Performance`.
 
     >>> keep_programs(False)
     >>> str(performance()).partition(";")[0]
@@ -434,7 +435,7 @@ def _usual_folder() -> Path:
 
 
 def release_programs() -> None:
-    """Releases all programs in memory; those on disk stay."""
+    """Releases all programs in memory; programs on disk stay."""
     with _recent_lock:
         _recent.clear()
         _loaded_by.clear()
@@ -447,9 +448,9 @@ class ProgramCounts(NamedTuple):
     """Programs that this process has made so far.
 
     Attributes:
-        compiled: How many it compiled.
-        loaded: How many it loaded from disk.
-        seconds: What tracing and compiling took by the clock, added over all threads [s].
+        compiled: Number of programs that it compiled.
+        loaded: Number of programs that it loaded from disk.
+        seconds: Elapsed time of tracing and compiling, added over all threads [s].
     """
 
     compiled: int = 0
@@ -461,7 +462,7 @@ _counts = [ProgramCounts()]
 
 
 def program_counts() -> ProgramCounts:
-    """Programs that this process has made so far; the difference of two calls is what lay between them."""
+    """Programs that this process has made so far; subtract two results for the programs between two calls."""
     return _counts[0]
 
 
@@ -472,7 +473,7 @@ def _count(compiled: int = 0, loaded: int = 0, seconds: float = 0.0) -> None:
 
 
 def _used(held: _Held) -> None:
-    """Notes that a program was used; where too many are held, those not used for longest are released."""
+    """Notes that a program was used; if there are too many in memory, releases the least recently used."""
     with _recent_lock:
         _recent[held] = None
         _recent.move_to_end(held)
@@ -483,24 +484,24 @@ def _used(held: _Held) -> None:
             return
         released = [_recent.popitem(last=False)[0] for _ in range(len(_recent) - LEFT_HELD)]
     for old in released:
-        if old.place.get(old.key) is old:  # and not one that another thread has made at the same time
+        if old.place.get(old.key) is old:  # not a program that another thread has made meanwhile
             old.place.pop(old.key, None)
     del released
     _return_memory()
 
 
 def _return_memory() -> None:
-    """Gives memory that programs have left back to the system, where the C library can."""
+    """Returns freed memory to the system, if the C library can do so."""
     gc.collect()
     with contextlib.suppress(OSError, AttributeError):
         ctypes.CDLL(None).malloc_trim(0)
 
 
 def static_key(value: Any) -> str:
-    """A text that identifies a static value; empty where there is none.
+    """A text that identifies a static value; empty if there is no such text.
 
-    It exists for values made of numbers, strings and classes of this package. The equation of an effect of a
-    user may change unnoticed, so programs with one are not stored.
+    The text exists for values that consist of numbers, strings and classes of this package. The equation of a
+    user's own effect may change unnoticed, so programs with such an effect are not stored.
 
     >>> from rotflex_jax.mechanism import Exponential
     >>> static_key(Exponential(order=4)).partition("(")[2][:9]
@@ -526,24 +527,24 @@ def _parts(value: Any) -> Iterator[str | None]:
         yield None
     elif isinstance(value, enum.Enum):
         yield str(value)
-    elif isinstance(value, tuple):  # a named one
+    elif isinstance(value, tuple):  # a named tuple
         yield f"{kind.__module__}.{kind.__qualname__}"
         yield from _parts(tuple(value))
     elif dataclasses.is_dataclass(value):
         yield f"{kind.__module__}.{kind.__qualname__}"
         yield from _parts(tuple(getattr(value, f.name) for f in dataclasses.fields(value)))
-    else:  # an object that holds nothing is known by its class
+    else:  # an object without attributes is identified by its class
         yield None if getattr(value, "__dict__", True) else f"{kind.__module__}.{kind.__qualname__}"
 
 
 def _plain() -> bool:
-    """Whether to use `jax.jit` alone: not on a CPU, or with checks at each call."""
+    """Whether to use `jax.jit` alone: if JAX does not run on a CPU, or does checks at each call."""
     return jax.default_backend() != "cpu" or any(getattr(jax.config, w) for w in _WATCHED)
 
 
 @functools.cache
 def _options() -> dict[str, Any]:
-    """For the compiler; those that this XLA knows."""
+    """Compiler options, as far as this XLA knows them."""
     known = {}
     for name, value in _FOR_COMPILER.items():
         with contextlib.suppress(jax.errors.JaxRuntimeError):
@@ -553,7 +554,7 @@ def _options() -> dict[str, Any]:
 
 
 def _surroundings() -> str:
-    """Hash of everything that all programs depend on."""
+    """Hash of everything on which all programs depend."""
     values = {n: v for n, v in jax.config.values.items() if "cache" not in n and n not in _SETTINGS}
     parts = (_SOURCE, jax.__version__, metadata.version("jaxlib"), sorted(values.items()), _processor())
     options = [o for o in os.environ.get("XLA_FLAGS", "").split() if o != FAST_LOOPS_FLAG]
@@ -563,7 +564,7 @@ def _surroundings() -> str:
 
 @functools.cache
 def _processor() -> str:
-    """What machine code depends on."""
+    """Description of the processor, on which machine code depends."""
     known = Path("/proc/cpuinfo")
     lines = known.read_text(errors="replace").splitlines() if known.exists() else []
     told = {line for line in lines if line.startswith(("flags", "Features", "model name", "CPU part"))}
@@ -571,34 +572,34 @@ def _processor() -> str:
 
 
 def _unchanged() -> bool:
-    """Whether the source on disk is what this process has loaded."""
+    """Whether the source on disk is the same that this process has loaded."""
     return all(file.exists() and file.stat().st_mtime < _LOADED - _ABOUT for file in _SOURCES)
 
 
 @functools.cache
 def _prepare_loading() -> None:
-    """Let JAX find its linear algebra, as it does when it lowers a program that needs it."""
+    """Let JAX register its linear algebra, as it does when it lowers a program that needs it."""
     jax.jit(jnp.linalg.solve).lower(np.eye(1, dtype=np.float32), np.ones(1, np.float32))
 
 
 def _read(file: Path, leaves: list[Any]) -> tuple[Callable[..., Any], Any] | None:
-    """The program in a file and what it gives for arguments; None without one that runs with these."""
+    """The program in a file and its result for these arguments; None if no program there runs with them."""
     try:
         coming = _coming.pop(file, None)
         program = _stored_program(file) if coming is None or coming.cancel() else coming.result()
         if program is None:
             return None
-        # What JAX had loaded from its own cache, and not compiled, may be stored without its functions.
+        # A program that JAX had loaded from its own cache, not compiled, may be stored without its functions.
         result = jax.block_until_ready(program(*leaves))
-        os.utime(file)  # what was used last is deleted last
+        os.utime(file)  # the most recently used is deleted last
         os.utime(file.parent)
         return program, result
-    except Exception:  # missing, or of another version: it is compiled again
+    except Exception:  # missing, or from another version: it is compiled again
         return None
 
 
 def _stored_program(file: Path) -> Callable[..., Any] | None:
-    """The program in a file; None where it is damaged."""
+    """The program in a file; None if the file is damaged."""
     data = file.read_bytes()
     digest, content = data[:32], data[32:]
     if hashlib.sha256(content).digest() != digest:
@@ -609,7 +610,7 @@ def _stored_program(file: Path) -> Callable[..., Any] | None:
 
 
 def _write(program: Any, file: Path) -> None:
-    """Stores a program; where that fails, the next process compiles it again."""
+    """Stores a program; if that fails, the next process compiles the program again."""
     with contextlib.suppress(Exception):  # the disk is full, or this JAX cannot store this program
         content = pickle.dumps(serialize_executable.serialize(program))
         if not file.parent.exists():
@@ -635,7 +636,7 @@ def _write_file(file: Path, content: bytes) -> None:
 
 
 def _shrink(folder: Path, most: int) -> None:
-    """Deletes the programs that were not used for the longest time, down to so many bytes."""
+    """Deletes the least recently used programs until at most `most` bytes are left."""
     total = 0
     for _, size, file in sorted(_stored(folder), reverse=True):
         total += size
@@ -644,7 +645,7 @@ def _shrink(folder: Path, most: int) -> None:
 
 
 def _stored(folder: Path) -> Iterator[tuple[float, int, Path]]:
-    """When each program in a folder was used last, its size, and its file."""
+    """Time of the last use, size and file of each program in a folder."""
     for file in folder.glob("*"):
         with contextlib.suppress(FileNotFoundError):  # another process has deleted it
             if file.is_dir():
@@ -653,9 +654,9 @@ def _stored(folder: Path) -> Iterator[tuple[float, int, Path]]:
 
 
 def _clear(folder: Path) -> None:
-    """Deletes what was used least recently, so that with one more there are programs of `_VERSIONS`.
+    """Deletes the least recently used versions, so that with one more there are `_VERSIONS` of them.
 
-    A folder that a user chose may hold other things, so that only folders with names like its own count.
+    A folder that the user chose may contain other things, so only folders whose names are such hashes count.
     """
     own = (f for f in folder.glob("*/") if re.fullmatch("[0-9a-f]{32}", f.name))
     found = sorted(own, key=lambda f: f.stat().st_mtime, reverse=True)
@@ -663,19 +664,19 @@ def _clear(folder: Path) -> None:
         shutil.rmtree(old, ignore_errors=True)
 
 
-# Linux allows 65530 by default; beyond that the compiler ends the process. One search may add some 30000
-# where it tries many different structures.
+# Linux allows 65530 memory maps by default; above that the compiler ends the process. A search that tries
+# many different structures may add about 30000.
 MOST_MEMORY_MAPS = 30_000
 
 
 def clear_compilation_caches(most: int = MOST_MEMORY_MAPS) -> bool:
-    """Releases all compiled code where the process has many memory maps; it is compiled again if needed.
+    """Releases all compiled code if the process has many memory maps; it is compiled again if needed.
 
     Args:
-        most: Maps the process may hold.
+        most: Number of memory maps that the process may have.
 
     Returns:
-        Whether code was released; never where the number of maps is not known (anywhere but on Linux).
+        Whether code was released; always False on systems other than Linux, where the number is not known.
     """
     maps = Path("/proc/self/maps")
     if not maps.exists() or maps.read_bytes().count(b"\n") < most:

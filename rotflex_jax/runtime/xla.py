@@ -1,7 +1,7 @@
 """Settings of JAX and of this machine: fast loops, compilation cache, precision, threads and devices.
 
-Importing the package changes no setting. Its first computation starts XLA, if nothing has started it before,
-with loops over samples compiled into one function each (`start_with_fast_loops`).
+Importing the package changes no setting. The first computation starts XLA, unless it was started before, with
+an option by which each loop over samples is compiled into one function (`start_with_fast_loops`).
 """
 
 import contextlib
@@ -23,30 +23,30 @@ from threadpoolctl import ThreadpoolController
 from rotflex_jax import checks
 from rotflex_jax.errors import InputError
 
-# A step with play, memories and friction touches some 17 KB for each direction of its slopes; beyond the
-# limit a run takes 2.7 to 4.4 times as long. Loops with matrix products of 64 to 300 rows lose nothing.
+# A step with play, memories and friction touches about 17 KB for each direction of its derivatives; above the
+# limit a run takes 2.7 to 4.4 times as long. Loops with matrix products of 64 to 300 rows do not get slower.
 _OPTION, _LIMIT = "xla_cpu_small_while_loop_byte_threshold", 2**21
 FAST_LOOPS_FLAG = f"--xla_backend_extra_options={_OPTION}={_LIMIT}"
-"""What `enable_fast_loops` adds to `XLA_FLAGS` unless it is given another limit."""
+"""Option that `enable_fast_loops` adds to `XLA_FLAGS`, with the default limit."""
 
 
 def enable_fast_loops(limit: int = _LIMIT) -> bool:
     """Ask XLA to compile a small loop on the CPU into one function, not one call per operation.
 
     A scan over the samples of a recording spends most of its time starting operations. XLA fuses a
-    whole loop as long as one iteration touches fewer bytes than a limit, 1024 by default.
-    Raising the limit makes simulating and fitting a joint five to twelve times faster.
+    whole loop if one iteration touches fewer bytes than a limit, 1024 by default.
+    A higher limit makes simulating and fitting a joint five to twelve times faster.
 
-    The package's first computation does it, unless XLA was started before; then neither has an effect, as
-    XLA reads `XLA_FLAGS` when it starts. Call this where other JAX code comes first.
+    The first computation of the package sets this option by itself, unless XLA was started before. XLA reads
+    `XLA_FLAGS` only when it starts, so call this function first if other JAX code runs before the package.
 
     Args:
-        limit: Memory that one iteration may touch [bytes]. Far larger values slow down loops with
-            big matrix products.
+        limit: Memory that one iteration may touch [bytes]. Much larger values slow down loops with
+            large matrix products.
 
     Returns:
-        True if `XLA_FLAGS` now carries the option. A value the user chose is kept, and nothing is
-        changed where `XLA_FLAGS` names a file of flags.
+        True if `XLA_FLAGS` now contains the option. A value that the user chose is kept, and nothing is
+        changed if `XLA_FLAGS` names a file of flags.
 
     Example:
         >>> import os
@@ -63,7 +63,7 @@ def enable_fast_loops(limit: int = _LIMIT) -> bool:
         return True
     if flags and not flags.startswith("-"):
         return False
-    # XLA merges several --xla_backend_extra_options, so the user's own stay in force.
+    # XLA merges several --xla_backend_extra_options, so the options of the user stay in force.
     os.environ["XLA_FLAGS"] = f"{flags} --xla_backend_extra_options={_OPTION}={limit}".strip()
     return True
 
@@ -71,17 +71,18 @@ def enable_fast_loops(limit: int = _LIMIT) -> bool:
 def enable_compilation_cache(folder: str | Path | None = None) -> Path | None:
     """Stores compiled code on disk, so that the next run of the program starts quickly.
 
-    Do not call it in a library: the setting holds for the whole process. Old entries are not
-    removed; deleting the folder is safe at any time. What lies there is run as a program: use a folder that
-    only you can write to, and none that you were given.
+    Do not call it in a library: the setting holds for the whole process. Old entries are not removed; you can
+    delete the folder at any time. The files there are run as programs: use a folder that only you can write
+    to, and do not use a folder that somebody gave to you.
 
     Args:
-        folder: For compiled code; the user's cache folder unless given. A folder that the user chose before
-            (`JAX_COMPILATION_CACHE_DIR`) is kept, and so is the shortest compilation that is stored
-            (`JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS`); without it all are stored.
+        folder: Folder for compiled code; by default in the user's cache folder. Without this argument, a
+            folder that the user chose before (`JAX_COMPILATION_CACHE_DIR`) is kept. The shortest compilation
+            time from which code is stored (`JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS`) is kept if it is
+            set; otherwise all code is stored.
 
     Returns:
-        The folder in use, or None where it cannot be written (then nothing is changed).
+        The folder in use, or None if the folder cannot be written (then nothing is changed).
     """
     if not (folder is None or isinstance(folder, str | os.PathLike)):
         raise InputError(
@@ -103,14 +104,14 @@ def enable_compilation_cache(folder: str | Path | None = None) -> Path | None:
         if not os.access(folder, os.W_OK):
             return None
         jax.config.update("jax_compilation_cache_dir", str(folder))
-    # Most programs compile in less than the second that JAX asks for, and a search needs dozens of them.
+    # Most programs compile in less than the one second that JAX requires, and a search needs dozens of them.
     if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     return Path(folder or chosen)
 
 
 def enable_fast_start() -> None:
-    """Both settings, for a program of its own, before it computes."""
+    """Set both options; for an application, before its first computation."""
     enable_fast_loops()
     enable_compilation_cache()
 
@@ -120,7 +121,7 @@ _starting = threading.Lock()
 
 @functools.cache
 def start_with_fast_loops() -> None:
-    """Start XLA as `enable_fast_loops` would, unless it has been started; the environment stays as it was.
+    """Start XLA with the option of `enable_fast_loops`, unless it has been started; keeps the environment.
 
     XLA reads its options once, when it starts.
     """
@@ -140,7 +141,7 @@ def start_with_fast_loops() -> None:
 def loops_are_fast() -> bool:
     """Whether XLA compiles a loop over samples into one function, in this process."""
     start_with_fast_loops()
-    x = np.ones(400, np.float32)  # a turn touches more than the usual limit
+    x = np.ones(400, np.float32)  # one iteration touches more than the default limit
     turn = lambda c, _: (jnp.tanh(c), None)  # noqa: E731
     program = jax.jit(lambda c: jax.lax.scan(turn, c, None, length=1000)).lower(x).compile()
     return "xla_cpu_small_call" in (program.as_text() or "")
@@ -149,7 +150,7 @@ def loops_are_fast() -> bool:
 def working_precision(*arrays: Num[np.ndarray, "..."]) -> contextlib.AbstractContextManager:
     """Context in which JAX keeps float64 if any of `arrays` is float64.
 
-    Outside it the user's own JAX configuration is untouched.
+    Outside of it the JAX configuration of the user is not changed.
     """
     start_with_fast_loops()
     if any(np.asarray(a).dtype == np.float64 for a in arrays):
@@ -169,7 +170,7 @@ Result = TypeVar("Result")
 
 
 def one_thread(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
-    """Decorator: inside the function linear algebra runs in one thread."""
+    """Decorator: inside the function, linear algebra runs on one thread."""
 
     @functools.wraps(function)
     def run(*args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
@@ -180,21 +181,22 @@ def one_thread(function: Callable[Parameters, Result]) -> Callable[Parameters, R
 
 
 def cores() -> int:
-    """How many cores this process may use."""
+    """Number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def on_threads(run: Callable[[Job], Result], jobs: Sequence[Job]) -> list[Result]:
     """Results of independent calls, on as many threads as there are cores.
 
-    A scan keeps one core busy; compiled code runs outside of Python's lock. Calls from within a call follow
-    one another on its thread: all threads may be busy with such calls. Where a call fails, or the user stops
-    the program, others that have begun end before the error is raised, at the latest when they come here.
+    A scan keeps one core busy, and compiled code runs without the lock of Python. Nested calls run one after
+    another on the thread of the outer call, because all threads may be busy with outer calls. If a call
+    fails, or the user stops the program, the other running calls end before the error is raised, at the
+    latest when they call this function.
 
     Args:
-        run: What to call; no two calls may run a program that spreads over devices. What several calls need
-            to be compiled is compiled once, by the first of them.
-        jobs: Its arguments.
+        run: Function to call; no two calls may run a program that spreads over devices. A program that
+            several calls need is compiled once, by the first of them.
+        jobs: Arguments of the calls.
     """
     outer: threading.Event | None = getattr(_own, "stopped", None)
     if outer is not None and outer.is_set():
@@ -218,7 +220,7 @@ def on_threads(run: Callable[[Job], Result], jobs: Sequence[Job]) -> list[Result
         wait([each for each in begun if not each.cancel()])
 
 
-# Of each of the threads below: whether what it works for has been stopped.
+# For each of the threads below: whether the call for which it works has been stopped.
 _own = threading.local()
 
 
@@ -228,10 +230,10 @@ def _threads() -> ThreadPoolExecutor:
 
 
 def bind_to_cores(place: int, of: int) -> None:
-    """Bind this process, one of several equal ones, to cores of its own, where the system allows it.
+    """Bind this process, number `place` of `of` equal processes, to its own cores, if the system allows it.
 
-    Threads that migrate between cores slow each other down. Call it before JAX computes, which starts as many
-    threads as it finds cores.
+    Threads that migrate between cores slow each other down. Call it before the first computation of JAX,
+    which starts as many threads as it finds cores.
     """
     if hasattr(os, "sched_setaffinity"):
         mine = sorted(os.sched_getaffinity(0))
@@ -243,7 +245,7 @@ def bind_to_cores(place: int, of: int) -> None:
 
 @functools.cache
 def _loaded() -> ThreadpoolController:
-    """The libraries of this process; finding them takes as long as a small fit."""
+    """The loaded thread-pool libraries of this process; finding them takes as long as a small fit."""
     import scipy.linalg  # noqa: F401 - JAX uses its library, and only loaded libraries can be limited
 
     return ThreadpoolController()
@@ -253,15 +255,15 @@ _ROWS = "rows"
 
 
 def mesh_of(devices: Sequence[Any] | None = None) -> Mesh | None:
-    """A row of devices, for `spread`.
+    """A one-dimensional mesh of devices, for `spread`.
 
     Args:
-        devices: those of this process if None, unless `jax.default_device` names one. With
-            `jax.distributed`, `jax.devices()` are those of all processes; then every process must make the
-            same call with the same numbers.
+        devices: the devices; all devices of this process if None, unless `jax.default_device` names one. With
+            `jax.distributed`, `jax.devices()` are the devices of all processes; then every process must make
+            the same call with the same numbers.
 
     Returns:
-        The mesh; None for a single device, which needs none.
+        The mesh; None for a single device, which needs no mesh.
 
     >>> mesh_of(jax.devices()[:1]) is None
     True
@@ -278,26 +280,27 @@ def mesh_of(devices: Sequence[Any] | None = None) -> Mesh | None:
 
 
 def spread(function: Callable[..., Any], mesh: Mesh | None) -> Callable[..., Any]:
-    """The same function, each device with its part of the rows of the first argument.
+    """The same function, distributed over devices: each device computes a part of the rows.
 
         spread(f, mesh)(rows, *shared) = f(rows, *shared)   to rounding
 
-    For use inside `jax.jit`, with `mesh` static. The rows must be independent, and `function`
-    must take any number of them. They are padded by the last one to a multiple of the devices, so a few
-    rows more than devices cost a second pass of all. Not for rows that take microseconds: sending
-    them costs more.
+    For use inside `jax.jit`, with `mesh` static. The rows must be independent, and `function` must take any
+    number of them. The last row is repeated up to a multiple of the number of devices, so a few rows more
+    than devices cost a second pass on all devices. Not for rows that take microseconds: sending them costs
+    more.
 
-    Devices of one process do not wait for each other where they divide the rows. Otherwise, and over several
-    processes, all get the whole at the end; XLA ends a program where one waits for another longer than a
-    minute, so such rows must take alike.
+    Devices of one process do not wait for each other if their number divides the number of rows. Otherwise,
+    and with several processes, all devices receive the whole result at the end. XLA ends a program in which
+    one device waits for another longer than a minute, so the rows must then take similar times.
 
     Args:
-        function: of rows (K, ...) and of what all rows share; its results have one entry a row, (K, ...).
-        mesh: from `mesh_of`; None leaves the function as it is.
+        function: function of rows (K, ...) and of arguments that all rows share; its results have one entry
+            for each row, (K, ...).
+        mesh: from `mesh_of`; with None the function is returned unchanged.
 
     Returns:
-        A function whose results every process has as a whole; between devices of one process they may lie in
-        parts.
+        A function whose results every process has as a whole; they may be distributed over the devices of one
+        process.
     """
     if mesh is None:
         return function
@@ -310,7 +313,7 @@ def spread(function: Callable[..., Any], mesh: Mesh | None) -> Callable[..., Any
             mesh=mesh,
             in_specs=(PartitionSpec(_ROWS), *(PartitionSpec() for _ in shared)),
             out_specs=PartitionSpec(_ROWS),
-            check_vma=False,  # a scan inside begins with the same carry on all devices
+            check_vma=False,  # a scan inside starts with the same carry on all devices
         )(jax.tree.map(lambda x: jnp.asarray(x)[full], rows), *shared)
         alone = all(device.process_index == jax.process_index() for device in mesh.devices.flat)
         if alone and len(full) == K:

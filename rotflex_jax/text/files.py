@@ -1,4 +1,4 @@
-"""Files written whole or not at all."""
+"""Writing of files, completely or not at all."""
 
 import errno
 import os
@@ -10,14 +10,14 @@ from rotflex_jax.checks import shown
 from rotflex_jax.errors import InputError
 
 UNFINISHED: set[Path] = set()
-"""Files that are being written, beside their places; whoever ends the process meanwhile takes them away."""
+"""Temporary files that are being written; code that ends the process must delete them."""
 
 
 def path_of(given: Any) -> Path:
-    """A path of what was given as one.
+    """The path that was given as text or as a path.
 
     Raises:
-        InputError: Something else, such as a number, which would name an open file.
+        InputError: Something else was given, such as a number, which would denote an open file.
     """
     if isinstance(given, str | os.PathLike):
         return Path(given)
@@ -25,28 +25,28 @@ def path_of(given: Any) -> Path:
 
 
 def without_folder(path: Path) -> InputError:
-    """What is said of a file whose folder does not exist."""
+    """The error for a file whose folder does not exist."""
     return InputError(
         f"{path} cannot be written, since the folder {path.parent} does not exist; create it or name another."
     )
 
 
 def write_file(path: str | os.PathLike[str], content: str | bytes) -> Path:
-    """Write a file beside its place and put it there in one step: an old file stays until then.
+    """Writes a temporary file and renames it in one step, so that an old file is kept until then.
 
     Args:
-        path: Of the file; a device or a pipe is written to as it is.
+        path: Path of the file; a device or a pipe is written to directly.
         content: Text, written in UTF-8, or bytes.
 
     Returns:
         The path.
 
     Raises:
-        InputError: It cannot be written: a full disk, no such folder, no permission.
+        InputError: The file cannot be written: a full disk, no such folder, no permission.
     """
     path = path_of(path)
     data = content if isinstance(content, bytes) else content.encode()
-    place = Path(os.path.realpath(path))  # a link goes on pointing to the file
+    place = Path(os.path.realpath(path))  # a symbolic link is kept, and its target is replaced
     part = place.with_name(f".{place.name[:100]}.{os.getpid()}.part")
     try:
         if place.exists() and not place.is_file():

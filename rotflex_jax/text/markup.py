@@ -20,7 +20,7 @@ _CELL = "padding:1px 14px 1px 0;vertical-align:top;white-space:nowrap;border:0"
 
 
 def card(title: str, *parts: str) -> str:
-    """A titled block of parts that are HTML already.
+    """A block with a title; its parts are HTML already.
 
     >>> card("Fit of <a>", paragraph("b & c"))[-59:]
     '<strong>Fit of &lt;a&gt;</strong><div>b &amp; c</div></div>'
@@ -35,13 +35,13 @@ def paragraph(text: str) -> str:
 
 
 def bullets(texts: Iterable[str]) -> str:
-    """Lines of text with bullets; nothing where there are none."""
+    """Lines of text with bullets; empty without lines."""
     items = "".join(f"<li>{escape(text)}</li>" for text in texts)
     return f'<ul style="margin:4px 0">{items}</ul>' if items else ""
 
 
 def folded(title: str, part: str) -> str:
-    """A part that opens on a click; nothing where there is none."""
+    """A part that opens on a click; empty without a part."""
     return f"<details><summary>{escape(title)}</summary>{part}</details>" if part else ""
 
 
@@ -49,9 +49,9 @@ def table(headings: Sequence[str], rows: Iterable[Sequence[str]], words: int = 1
     """A table of texts.
 
     Args:
-        headings: One per column.
-        rows: Cells.
-        words: How many columns hold words; those after them hold numbers and stand to the right.
+        headings: Heading of each column.
+        rows: Cells of each row.
+        words: Number of columns with words; the columns after them contain numbers and are aligned right.
     """
 
     def line(cells: Sequence[str], tag: str) -> str:
@@ -69,11 +69,11 @@ def table(headings: Sequence[str], rows: Iterable[Sequence[str]], words: int = 1
 
 
 def picture(svg: str, says: str) -> str:
-    """A drawing as an image that carries its own data.
+    """A drawing as an HTML image that contains its own data.
 
     Args:
-        svg: The drawing; nothing is shown where it is empty.
-        says: What it shows, for those who cannot see it.
+        svg: The drawing; the result is empty if it is empty.
+        says: Description of the drawing for readers who cannot see it.
     """
     if not svg:
         return ""
@@ -85,12 +85,12 @@ def picture(svg: str, says: str) -> str:
 
 
 def fill_template(package: str, name: str, content: Mapping[str, Any]) -> str:
-    """A page as text.
+    """An HTML page as text, from a template.
 
     Args:
-        package: Whose template it is; all share `page.html.j2` and one style sheet.
-        name: Of the template.
-        content: What it fills in; plain text, which it escapes. The date is added.
+        package: Package of the template; all packages share `page.html.j2` and one style sheet.
+        name: Name of the template.
+        content: Content of the template as plain text, which the template escapes. The date is added.
     """
     date = datetime.datetime.now().astimezone().strftime("%d %B %Y, %H:%M")
     return _template(package, name).render({**content, "date": date})
@@ -109,7 +109,7 @@ def _template(package: str, name: str) -> jinja2.Template:
 
 
 def write_files(folder: Path, files: Mapping[str, str | bytes]) -> None:
-    """Write files into a folder, which is created; files of these names are replaced.
+    """Writes files into a folder, which is created if needed; files with these names are replaced.
 
     Raises:
         InputError: The folder is a file, or cannot be written to.

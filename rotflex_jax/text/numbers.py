@@ -1,4 +1,4 @@
-"""Numbers, units and equations as they are printed or go into JSON; text of others made harmless."""
+"""Numbers, units and equations for print and for JSON, and safe forms of text from elsewhere."""
 
 import math
 import re
@@ -9,7 +9,7 @@ from rotflex_jax.parameters import Estimate
 
 
 def printable(text: str) -> str:
-    r"""A text without codes that steer a terminal; these are shown as escapes, line ends and tabs stay.
+    r"""A text with control codes of a terminal replaced by escapes; line ends and tabs are kept.
 
     >>> print(printable("run\x1b[2J.csv"))
     run\x1b[2J.csv
@@ -18,12 +18,12 @@ def printable(text: str) -> str:
 
 
 def _steers(character: str) -> bool:
-    """Whether a character is a control code, a change of the direction of writing, or half of a pair."""
+    """Whether a character is a control code, a change of the writing direction, or a lone surrogate."""
     return unicodedata.category(character) in ("Cc", "Cf", "Cs", "Zl", "Zp")
 
 
 def one_line(text: str) -> str:
-    r"""The same on one line.
+    r"""A text as in `printable`, on one line: line ends are replaced by escapes too.
 
     >>> print(one_line("run\n.csv"))
     run\n.csv
@@ -32,7 +32,7 @@ def one_line(text: str) -> str:
 
 
 def spreadsheet_cell(text: str) -> str:
-    """A text that no spreadsheet takes for a formula: an apostrophe stands before a sign that begins one.
+    """A text that no spreadsheet reads as a formula: an apostrophe precedes a character that begins one.
 
     >>> spreadsheet_cell("=1+1"), spreadsheet_cell("run 7")
     ("'=1+1", 'run 7')
@@ -41,7 +41,7 @@ def spreadsheet_cell(text: str) -> str:
 
 
 def together(text: str) -> str:
-    r"""A text whose numbers stay on a line with their units, powers as in print.
+    r"""A text in which numbers stay on one line with their units, and powers are superscripts.
 
     >>> together("0.03 N m at 2 deg").split(" ")
     ['0.03\xa0N\xa0m', 'at', '2\xa0deg']
@@ -51,7 +51,7 @@ def together(text: str) -> str:
 
 
 def equation(text: str) -> str:
-    """An equation with the signs of print.
+    """An equation with typographic characters.
 
     >>> equation("tau = -stiffness * position^3, holds while |tau| <= level")
     'τ = −stiffness · position³, holds while |τ| ≤ level'
@@ -70,7 +70,7 @@ def equation(text: str) -> str:
 
 
 def unit_text(unit: str) -> str:
-    """A unit with the signs of print.
+    """A unit with typographic characters.
 
     >>> unit_text("N m/rad^3")
     'N m/rad³'
@@ -79,7 +79,7 @@ def unit_text(unit: str) -> str:
 
 
 def plain_number(value: float | None, digits: int = 3) -> str:
-    """A number of some significant digits, powers of ten as in print.
+    """A number with some significant digits and a typographic power of ten.
 
     >>> plain_number(0.0123456), plain_number(1.5e-6), plain_number(None)
     ('0.0123', '1.5 × 10⁻⁶', '–')
@@ -96,7 +96,7 @@ def plain_number(value: float | None, digits: int = 3) -> str:
 
 
 def json_number(value: float) -> float | None:
-    """A number that JSON can carry; None where it is infinite or not a number.
+    """A number that JSON can represent; None if it is infinite or NaN.
 
     >>> json_number(0.5), json_number(float("inf")), json_number(float("nan"))
     (0.5, None, None)
@@ -105,12 +105,12 @@ def json_number(value: float) -> float | None:
 
 
 def json_numbers(values: Mapping[str, float]) -> dict[str, float | None]:
-    """The values of a mapping, each as `json_number` gives it."""
+    """The mapping with `json_number` applied to every value."""
     return {name: json_number(value) for name, value in values.items()}
 
 
 def digits(value: float | None, count: int = 3, missing: str = "-") -> str:
-    """A number of some significant digits in plain characters, for tables of a terminal.
+    """A number with some significant digits in plain characters, for tables in a terminal.
 
     >>> digits(0.0123456), digits(7052.3, 4), digits(None)
     ('0.0123', '7052', '-')
@@ -119,7 +119,7 @@ def digits(value: float | None, count: int = 3, missing: str = "-") -> str:
 
 
 def value_and_interval(estimate: Estimate) -> tuple[str, str]:
-    """The value and its 95 % interval, with as many digits as the interval is worth.
+    """The value and its 95 % interval, with as many digits as the interval justifies.
 
     >>> nan = float("nan")
     >>> value_and_interval(Estimate("a", 0.0300069, 1e-5, (0.029987, 0.030027), "N m"))
@@ -140,12 +140,12 @@ def value_and_interval(estimate: Estimate) -> tuple[str, str]:
 
 
 def ratio(value: float, floor: float | None) -> float:
-    """How many times the noise an error is; nan where no noise is known."""
+    """Ratio of an error to the noise; NaN if no noise is known."""
     return value / floor if floor and floor > 0 else math.nan
 
 
 def multiple(times: float) -> str:
-    """How many times the noise an error is, as it stands in every sentence, tile and table.
+    """The ratio of an error to the noise as text, for all sentences, tiles and tables.
 
     >>> multiple(1.168), multiple(23.456), multiple(228.6), multiple(39885.0)
     ('1.17', '23.46', '229', 'over 10,000')
@@ -156,7 +156,7 @@ def multiple(times: float) -> str:
 
 
 def percent_explained(percent: float) -> str:
-    """A share near 100 % with as many digits as what is left of it is worth.
+    """A share in percent, with more digits near 100 %.
 
     >>> [percent_explained(p) for p in (83.21, 99.871, 99.99999, -3.0)]
     ['83.2 %', '99.87 %', '> 99.99 %', '0 %']
@@ -167,7 +167,7 @@ def percent_explained(percent: float) -> str:
 
 
 def percent_of_whole(fraction: float) -> str:
-    """A part of a whole, for a sentence.
+    """A fraction of a whole in percent, for a sentence.
 
     >>> [percent_of_whole(f) for f in (0.784, 0.0042, 0.998, 1.0)]
     ['78 %', '0.4 %', '99.8 %', 'all']
@@ -179,7 +179,7 @@ def percent_of_whole(fraction: float) -> str:
 
 
 def percent_own(fraction: float) -> str:
-    """A share of a whole, of which small ones differ by powers of ten.
+    """A fraction in percent with two significant digits, for shares that differ by orders of magnitude.
 
     >>> [percent_own(f) for f in (0.997, 0.413, 0.0152, 0.00041)]
     ['100 %', '41 %', '1.5 %', '0.041 %']
@@ -188,7 +188,7 @@ def percent_own(fraction: float) -> str:
 
 
 def percent_left(fraction: float) -> str:
-    """What is left of something, as a fraction of it; may be more than all of it.
+    """A remaining fraction in percent, which may be above 100 %.
 
     >>> [percent_left(f) for f in (0.0152, 0.608, 1.59)]
     ['1.5 %', '61 %', '159 %']
@@ -199,7 +199,7 @@ def percent_left(fraction: float) -> str:
 
 
 def percent_probable(probability: float) -> str:
-    """A probability as people read it.
+    """A probability in percent, limited to 1 % and 99 %.
 
     >>> [percent_probable(p) for p in (0.9997, 0.934, 0.0312, 0.0004)]
     ['> 99 %', '93 %', '3 %', '< 1 %']
@@ -210,7 +210,7 @@ def percent_probable(probability: float) -> str:
 
 
 def as_read(value: float, unit: str) -> tuple[float, str]:
-    """A value in the unit that people read: degrees for angles, millimetres for lengths.
+    """A value in the unit for display: degrees for angles, millimetres for lengths.
 
     >>> as_read(0.00085, "m"), as_read(0.5, "V")
     ((0.85, 'mm'), (0.5, 'V'))
@@ -221,6 +221,6 @@ def as_read(value: float, unit: str) -> tuple[float, str]:
 
 
 def readable(value: float, unit: str) -> tuple[float, str]:
-    """The same with the unit in the signs of print."""
+    """A value in the unit for display, as in `as_read`, with the unit in typographic characters."""
     number, read = as_read(value, unit)
     return number, unit_text(read)

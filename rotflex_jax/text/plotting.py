@@ -1,4 +1,4 @@
-"""The style of the figures, without global state of pyplot, and the figures of a page with their captions."""
+"""Style of figures, without the global state of pyplot, and the figures of a page with their captions."""
 
 import dataclasses
 import functools
@@ -60,7 +60,7 @@ _STYLE: Any = {
 
 
 def styled(draw: Callable[P, Drawn]) -> Callable[P, Drawn]:
-    """A function that draws in this style and leaves matplotlib's settings as they were."""
+    """Decorator that applies the style of the package while a function draws, then restores matplotlib's."""
 
     @functools.wraps(draw)
     def inside(*args: P.args, **kwargs: P.kwargs) -> Drawn:
@@ -71,7 +71,7 @@ def styled(draw: Callable[P, Drawn]) -> Callable[P, Drawn]:
 
 
 class Drawing(Figure):
-    """A figure that a notebook shows by itself, whether or not a backend of pyplot is loaded there."""
+    """A figure that a notebook displays even without a backend of pyplot."""
 
     def _repr_png_(self) -> bytes:
         buffer = io.BytesIO()
@@ -81,14 +81,14 @@ class Drawing(Figure):
 
 
 def blank(width: float, height: float) -> Figure:
-    """An empty figure [inch]; 10 is the width of the page."""
+    """An empty figure with a width and a height [inch]; a page is 10 inches wide."""
     figure = Drawing(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
     return figure
 
 
 def legend_above(figure: Figure, axes: Iterable[Axes], columns: int = 6) -> None:
-    """One legend over the whole figure, where it covers no data."""
+    """Adds one legend for all axes above them, where it covers no data."""
     entries: dict[str, Any] = {}
     for ax in axes:
         for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
@@ -106,7 +106,7 @@ def legend_above(figure: Figure, axes: Iterable[Axes], columns: int = 6) -> None
 def thinned(
     t: Real[np.ndarray, " N"], y: Real[np.ndarray, " N"], most: int = 1600
 ) -> tuple[Real[np.ndarray, " M"], Real[np.ndarray, " M"]]:
-    """The same line with fewer points: the smallest and the largest of each group of neighbours."""
+    """A line with fewer points: the smallest and the largest value of each group of neighbours."""
     groups = len(y) // max(1, most // 2)
     if groups < 4:
         return t, y
@@ -118,7 +118,7 @@ def thinned(
 
 
 def plain_ticks(axis: Axis) -> None:
-    """Ticks as numbers without powers of ten."""
+    """Formats the ticks of an axis as numbers without powers of ten."""
     axis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:,g}".translate(_SIGNS)))
     axis.set_minor_formatter(NullFormatter())
 
@@ -127,19 +127,19 @@ _SIGNS = str.maketrans({",": "\u202f", "-": "−"})
 
 
 def data_address(figure: Figure) -> str:
-    """The figure as an SVG image inside an address, so that a page needs no other file."""
+    """The figure as an SVG image in a data URL, so that a page needs no other file."""
     buffer = io.StringIO()
     with matplotlib.rc_context(_STYLE):
         figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
     svg = _UNUSED.sub("", buffer.getvalue())
     svg = _COORDINATES.sub(lambda found: _LONG_NUMBER.sub(_rounded, found[0]), svg)
-    # A third less than in base 64, and a page is to stay small enough to be sent.
+    # Percent encoding is a third smaller than base 64; pages should be small enough for e-mail.
     return "data:image/svg+xml;charset=utf-8," + quote(" ".join(svg.split()), safe=_KEPT)
 
 
-# What no browser reads: a document type, and metadata with addresses of vocabularies.
+# Parts that a browser does not need: the document type, and metadata.
 _UNUSED = re.compile(r"<!DOCTYPE[^>]*>|<metadata>.*?</metadata>", re.DOTALL)
-# Coordinates [1/72 inch] are written to a hundredth, which nobody can see.
+# Coordinates [1/72 inch] are rounded to a hundredth, which is invisible.
 _COORDINATES, _LONG_NUMBER = re.compile(r' (?:d|x|y)="[^"]*"'), re.compile(r"-?\d+\.\d{3,}")
 _KEPT = " =:/,;()!$*@?[]{}|^`~+"
 
@@ -150,14 +150,14 @@ def _rounded(number: re.Match[str]) -> str:
 
 @dataclasses.dataclass(frozen=True)
 class Picture:
-    """A figure with its words.
+    """A figure with its caption and description.
 
     Attributes:
-        section: Of the page, where it stands.
-        figure: What is drawn.
-        caption: One or two sentences: what to see.
-        description: For those who cannot see it.
-        zoom: The same to pan and zoom, on a page that carries the script; None for a still picture.
+        section: Section of the page that shows the figure.
+        figure: The figure.
+        caption: One or two sentences on what the figure shows.
+        description: Description for readers who cannot see the figure.
+        zoom: Data of the figure for pan and zoom, on a page with the script; None for a still picture.
     """
 
     section: str
@@ -168,7 +168,7 @@ class Picture:
 
     @property
     def on_page(self) -> dict[str, Any]:
-        """What a template needs: address, width [% of the page], caption, description, data to zoom."""
+        """Values for a template: address, width [% of the page], caption, description, data for zoom."""
         return {
             "address": data_address(self.figure),
             "width": round(10 * self.figure.get_figwidth()),
@@ -179,7 +179,7 @@ class Picture:
 
 
 class FigureRegistry:
-    """The figures of one kind of page: each stands with its caption where it is drawn."""
+    """The figures of one kind of page, each with a caption, which is defined where the figure is drawn."""
 
     def __init__(self) -> None:
         self._entries: list[tuple[str, str, Callable[..., Figure | None], Caption, str, Zoom]] = []
@@ -187,14 +187,14 @@ class FigureRegistry:
     def figure(
         self, name: str, *, section: str, caption: Caption, description: str, zoom: Zoom = None
     ) -> Callable[[Callable[P, Drawn]], Callable[P, Drawn]]:
-        """Enter a function that draws a figure, or None where there is nothing to show.
+        """Decorator that registers a function, which draws a figure or returns None without anything to show.
 
         Args:
-            name: Of the picture.
-            section: Of the page, where it stands, after those entered before it.
-            caption: What to see; or a function that says so of what is drawn.
-            description: For those who cannot see it.
-            zoom: Gives the same to pan and zoom; a still picture without.
+            name: Name of the picture.
+            section: Section of the page, in which figures have the order of their registration.
+            caption: The caption, or a function of the subjects that returns it.
+            description: Description for readers who cannot see the figure.
+            zoom: Function that returns the data for pan and zoom; None for a still picture.
         """
 
         def enter(draw: Callable[P, Drawn]) -> Callable[P, Drawn]:
@@ -205,10 +205,11 @@ class FigureRegistry:
         return enter
 
     def pictures(self, *subjects: Any) -> dict[str, Picture]:
-        """All figures that have something to show, by name.
+        """Name -> figure, without figures that have nothing to show.
 
         Args:
-            subjects: What is drawn. Functions and captions are given as many of them as they take.
+            subjects: Arguments of the functions, such as the result of a search. A function gets as many of
+                them as it has parameters.
         """
         drawn = {}
         for name, section, draw, caption, description, zoom in self._entries:
@@ -225,7 +226,7 @@ def _given(function: Callable[..., Any], subjects: tuple[Any, ...]) -> Any:
 
 
 def by_section(pictures: Iterable[Picture]) -> dict[str, list[dict[str, Any]]]:
-    """Section -> what a template needs of its pictures; an empty list for a section that has none."""
+    """Section -> template values of its pictures; an empty list for a section without pictures."""
     sections: dict[str, list[dict[str, Any]]] = defaultdict(list)
     for picture in pictures:
         sections[picture.section].append(picture.on_page)

@@ -1,4 +1,4 @@
-"""Small drawings as SVG text: signals over time, bars, and the staircase of held-out errors."""
+"""Small drawings as SVG text: signals over time, bars, and held-out errors of successive models."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -17,8 +17,8 @@ class Panel(NamedTuple):
     """Lines over one axis.
 
     Attributes:
-        label: Of the vertical axis, with its unit.
-        lines: (values, colour, SVG dash pattern) each; as many values as the horizontal axis has.
+        label: Label of the vertical axis, with its unit.
+        lines: Values, colour and SVG dash pattern of each line; as many values as the horizontal axis has.
     """
 
     label: str
@@ -45,7 +45,7 @@ def _path(x: np.ndarray, y: np.ndarray, colour: str, dash: str = "", width: floa
 
 
 def _thin(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The same line with fewer points: the smallest and the largest of each group of neighbours."""
+    """A line with fewer points: the smallest and the largest value of each group of neighbours."""
     group = -(-len(y) // (_POINTS // 2))
     if group < 3:
         return x, y
@@ -58,14 +58,14 @@ def _thin(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def signals(
     x: Real[np.ndarray, " N"], panels: Sequence[Panel], label: str, width: float = 560, height: float = 58
 ) -> str:
-    """Panels under each other over one axis.
+    """Panels one below the other with a common horizontal axis.
 
     Args:
-        x: Horizontal axis (N,).
-        panels: From top to bottom.
-        label: Of the horizontal axis, with its unit.
-        width: Of the drawing [px].
-        height: Of each panel [px].
+        x: Values of the horizontal axis (N,).
+        panels: Panels from top to bottom.
+        label: Label of the horizontal axis, with its unit.
+        width: Width of the drawing [px].
+        height: Height of each panel [px].
     """
     parts, low, high = [], float(x[0]), float(x[-1])
     across = lambda v: _LEFT + (width - _LEFT - 8) * (np.asarray(v) - low) / ((high - low) or 1.0)  # noqa: E731
@@ -96,9 +96,9 @@ def bars(rows: Sequence[tuple[str, float, str]], label: str, width: float = 560)
     """Horizontal bars on a logarithmic scale.
 
     Args:
-        rows: (name, positive value, its text) each; others are left out.
-        label: Of the axis, with its unit.
-        width: Of the drawing [px].
+        rows: Name, value and text of the value of each bar; rows whose value is not positive are left out.
+        label: Label of the axis, with its unit.
+        width: Width of the drawing [px].
     """
     rows = [row for row in rows if math.isfinite(row[1]) and row[1] > 0]
     if not rows:
@@ -127,11 +127,11 @@ def staircase(
     """Held-out error of each model, one panel per channel, on a logarithmic scale, with the sensor noise.
 
     Args:
-        labels: One per model, in order.
-        errors: Channel with its unit -> error of each model; what is not finite is left out.
-        floor: The same channel -> noise of its sensor.
-        width: Of the drawing [px].
-        height: Of the drawing [px].
+        labels: Label of each model, in order.
+        errors: Channel with its unit -> error of each model; errors that are not finite are left out.
+        floor: Channel with its unit -> noise of its sensor.
+        width: Width of the drawing [px].
+        height: Height of the drawing [px].
     """
     parts: list[str] = []
     each = width / max(len(errors), 1)
@@ -174,7 +174,7 @@ def staircase(
 
 
 def _lines(text: str, width: float) -> list[str]:
-    """Words in lines of about this width [px]."""
+    """The words of a text in lines of approximately a given width [px]."""
     lines = [""]
     for word in text.split(" "):
         if lines[-1] and 5.4 * (len(lines[-1]) + len(word) + 1) > width:

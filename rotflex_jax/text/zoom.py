@@ -1,7 +1,8 @@
-"""What a figure of a page holds to be panned and zoomed: lines over time, maps over a plane.
+"""Data of figures with pan and zoom: lines over time, maps over a plane.
 
-`templates/zoom.js` draws it in a browser, with uPlot. Numbers are 32 bit in base 64, and of what would make a
-page too large the least and the largest value of each group of samples are kept, so that no peak is hidden.
+`templates/zoom.js` draws them in a browser, with uPlot. Numbers are written with 32 bits in base 64. If a
+page would become too large, only the least and the largest value of each group of samples of a line are kept,
+so that peaks stay visible, and maps use a part of their samples.
 """
 
 import base64
@@ -13,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 MOST_LINE_VALUES, MOST_MAP_VALUES = 200_000, 75_000
-"""Numbers that the lines, and that the maps of a page may hold; each takes 5.3 bytes."""
+"""Most numbers in the lines and in the maps of a page; each number takes 5.3 bytes."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -21,11 +22,11 @@ class Line:
     """One line over time.
 
     Attributes:
-        label: What it is.
-        colour: Of the line.
-        values: One per sample; a gap where not finite.
-        width: Of the line [px].
-        dash: Lengths of dashes and gaps [px]; solid without.
+        label: Label of the line.
+        colour: Colour of the line.
+        values: One value per sample; a value that is not finite makes a gap.
+        width: Width of the line [px].
+        dash: Lengths of dashes and gaps [px]; empty for a solid line.
     """
 
     label: str
@@ -37,14 +38,14 @@ class Line:
 
 @dataclasses.dataclass(frozen=True)
 class LinePanel:
-    """Lines with one scale.
+    """Lines with a common vertical scale.
 
     Attributes:
-        label: Of the scale, with its unit.
-        lines: What is drawn.
-        height: Of the panel [px].
-        band: Half width of a grey band around zero; none at 0.
-        limits: What the scale never goes beyond, such as a run that diverges; anything where None.
+        label: Label of the scale, with its unit.
+        lines: The lines.
+        height: Height of the panel [px].
+        band: Half width of a grey band around zero; 0 for none.
+        limits: Limits of the scale, for instance if a run diverges; None for no limits.
     """
 
     label: str
@@ -56,12 +57,12 @@ class LinePanel:
 
 @dataclasses.dataclass(frozen=True)
 class Stretch:
-    """A part of the time that a reader is led to.
+    """A stretch of time to which a button on the page zooms.
 
     Attributes:
-        label: What is there.
-        start: Where it begins [s].
-        end: Where it ends [s].
+        label: Text of the button.
+        start: Start of the stretch [s].
+        end: End of the stretch [s].
     """
 
     label: str
@@ -71,14 +72,14 @@ class Stretch:
 
 @dataclasses.dataclass(frozen=True)
 class LineView:
-    """Panels one below the other over one axis of time.
+    """Panels one below the other with a common time axis.
 
     Attributes:
         start: Time of the first sample [s].
         Ts: Sampling period [s].
-        panels: From the top down.
-        stretches: Parts that a reader is led to.
-        marks: Times that are marked, such as new starts of a run [s].
+        panels: Panels from top to bottom.
+        stretches: Stretches of time to which buttons on the page zoom.
+        marks: Times with a mark, such as the starts of the windows of a run [s].
     """
 
     start: float
@@ -91,7 +92,7 @@ class LineView:
         """Plain values for the script of a page."""
         lines = [line for panel in self.panels for line in panel.lines]
         N = max(len(line.values) for line in lines)
-        # Two values stay of each group of samples, so that a group of one or two is left as it is.
+        # Two values of each group of samples are kept.
         group = -(-2 * N * len(lines) // MOST_LINE_VALUES) if N * len(lines) > MOST_LINE_VALUES else 1
         count = N if group == 1 else 2 * -(-N // group)
         note = (
@@ -137,12 +138,12 @@ class PlaneMap:
     """A mean over cells of a plane.
 
     Attributes:
-        title: Over the map.
-        values: One per sample; a sample that is not finite does not count.
-        unit: Of the values, in brackets.
-        colours: From the lower limit to the upper one.
-        limits: Values of the first and the last colour.
-        squared: Whether a cell is the root mean square instead of the mean.
+        title: Title of the map.
+        values: One value per sample; values that are not finite are left out.
+        unit: Unit of the values, in brackets.
+        colours: Colours from the lower limit to the upper one.
+        limits: Values of the first and of the last colour.
+        squared: Whether a cell shows the root mean square instead of the mean.
     """
 
     title: str
@@ -158,13 +159,13 @@ class MapView:
     """Maps of samples over one plane; zooming counts the samples again in smaller cells.
 
     Attributes:
-        x: Where each sample lies to the right.
-        y: Where each sample lies upwards.
-        labels: Of both, with units.
-        ranges: What is shown of both at first.
-        maps: Side by side.
-        cells: Along each side of a map.
-        least: Samples without which a cell stays blank.
+        x: Horizontal coordinate of each sample.
+        y: Vertical coordinate of each sample.
+        labels: Labels of both axes, with units.
+        ranges: Ranges of both axes at first.
+        maps: The maps, side by side.
+        cells: Number of cells along each side of a map.
+        least: Least number of samples of a cell that is drawn.
     """
 
     x: Float[np.ndarray, " N"]
@@ -207,11 +208,11 @@ class MapView:
 
 
 def extremes(values: Float[np.ndarray, " N"], group: int) -> Float[np.ndarray, " M"]:
-    """The least and the largest value of each group of samples, in the order in which they came.
+    """The least and the largest value of each group of samples, in their order in time.
 
     Args:
-        values: One per sample; those that are not finite count only where a group has no others.
-        group: Samples of a group; 1 leaves all values as they are.
+        values: One value per sample; values that are not finite are kept only if a group has no others.
+        group: Number of samples in a group; 1 leaves all values unchanged.
 
     >>> extremes(np.array([0.0, 9.0, 1.0, -5.0, 2.0, 2.0, 3.0]), 4)
     array([ 9., -5.,  2.,  3.])
@@ -227,12 +228,12 @@ def extremes(values: Float[np.ndarray, " N"], group: int) -> Float[np.ndarray, "
 
 
 def encoded(values: Float[np.ndarray, " N"]) -> str:
-    """Numbers as 32 bit, low byte first, in base 64."""
-    with np.errstate(over="ignore"):  # what diverges is a gap
+    """Numbers with 32 bits, low byte first, in base 64."""
+    with np.errstate(over="ignore"):  # a value that is too large becomes infinite, which makes a gap
         return base64.b64encode(np.asarray(values).astype("<f4").tobytes()).decode("ascii")
 
 
 def as_text(view: LineView | MapView) -> str:
-    """A view as JSON that may stand inside a page as it is, whatever its labels are."""
+    """A view as JSON that an HTML page can contain unchanged, whatever its labels are."""
     text = json.dumps(view.to_dict(), ensure_ascii=False, separators=(",", ":"), allow_nan=False)
     return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")

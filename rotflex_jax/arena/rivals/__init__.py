@@ -1,19 +1,19 @@
-"""Other ways to find a hidden effect, on the arena's records: each names effects as the search does.
+"""Other methods that find hidden effects in the arena's recordings; each names effects, as the search does.
 
-Every rival gets what the search gets: training and validation recording, the textbook joint, the names of
-the effects. It fits to the first and decides on the second how many effects or which threshold. Its answer is
-marked like the search's, and the structure that it names is fitted by the package's own grey box for the
-held-out error, so that a rival is never marked down for a poor fit. None of them can say that something stays
-unexplained: a regression has no measure of what it leaves.
+Every rival gets the same data as the search: training and validation recording, the textbook joint, the names
+of the effects. It is fitted to the training recording; the validation recording determines how many effects
+it names, or a threshold. Its answer is marked like the answer of the search. For the held-out error, the
+package fits the grey-box model with the named effects, so a poor fit by the rival does not count. None of the
+rivals can report that something remains unexplained: they do not test their residuals.
 
-* `motion` - smoothed positions, speeds, accelerations, and the torque that the linear joint misses;
-* `terms` - what the named effects look like as columns over that motion;
-* `selection` - forward selection by BIC, shared by all that regress;
+* `motion` - smoothed positions, speeds, accelerations, and the torque that the linear joint does not explain;
+* `terms` - the effects as columns of torques along this motion;
+* `selection` - forward selection by BIC, shared by the methods that regress;
 * `balance` - regression of the torque balance (inverse dynamics);
-* `residual` - regression of the free-run error on the joint's answer to each term;
-* `sindy` - sparse regression of accelerations through pysindy: plain, ensemble, weak;
-* `refit` - every effect of the catalogue refitted, the best taken by BIC;
-* `neural` - a network torque learnt through the simulation, then read by sparse regression.
+* `residual` - regression of the free-run error on the response of the joint to each term;
+* `sindy` - sparse regression of accelerations with pysindy: plain, ensemble, weak;
+* `refit` - every effect of the catalogue fitted in turn, the best selected by BIC;
+* `neural` - a torque by a neural network, trained in simulation, then explained by forward selection.
 """
 
 from rotflex_jax.arena.rivals.answer import NamedEffects, Rival

@@ -1,4 +1,4 @@
-"""What another method is and what it answers."""
+"""Types of the other methods and of their answers."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ import rotflex_jax as rf
 from rotflex_jax.arena.simulator.laws import Place
 
 Rival = Callable[[rf.Recording, rf.Recording], "NamedEffects"]
-"""From the training and the validation recording to an answer."""
+"""Function of the training and the validation recording that returns an answer."""
 
 
 class NamedEffects(NamedTuple):
-    """Effects in the order in which they were found, and a phrase on how."""
+    """Effects in the order in which they were found, and a note on how they were found."""
 
     rounds: list[Place]
     note: str = ""

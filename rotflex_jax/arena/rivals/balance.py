@@ -1,4 +1,4 @@
-"""Regression of the torque balance, the inverse dynamics that robots are identified by."""
+"""Regression of the torque balance (inverse dynamics), as in the identification of robots."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from rotflex_jax.arena.rivals.terms import linear_columns, terms
 
 
 def balance(train: rf.Recording, validation: rf.Recording) -> NamedEffects:
-    """Forward selection among torques, for the torque that the linear joint does not explain."""
+    """Forward selection among the terms, for the torque that the linear joint does not explain."""
     m, after = motions(train, validation)
     scale, listed = weights(m), terms(m)
 
@@ -25,7 +25,7 @@ def balance(train: rf.Recording, validation: rf.Recording) -> NamedEffects:
 
 
 def weights(m: Motion) -> Values:
-    """(2, 2) turns generalised torques into the two independent ones, each in units of its scatter."""
-    # On the hub: what acts on theta less what acts on alpha; on the arm: what acts on alpha.
+    """Matrix (2, 2) from generalised torques to torques on hub and arm, each of unit standard deviation."""
+    # Hub: generalised torque on theta minus the one on alpha; arm: generalised torque on alpha.
     split = np.array([[1.0, -1.0], [0.0, 1.0]])
     return split / np.std(m.missing @ split.T, axis=0)[:, None]

@@ -1,9 +1,8 @@
 r"""Positions, speeds and accelerations from counted angles, and the linear joint to compare them with.
 
-Differentiating an encoder twice is what every regression of accelerations stands or falls with.
-The smoother is a cubic Savitzky-Golay filter; its window is the one that leaves the torque balance of
-the joint with the smallest relative residual, since a short window lets noise in and a long one takes
-motion away.
+Every regression of accelerations depends on a good second derivative of the encoder readings. The smoother is
+a cubic Savitzky-Golay filter. Its window is the one with the smallest relative residual of a linear torque
+balance, since a short window passes noise and a long window removes motion.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ import rotflex_jax as rf
 from rotflex_jax.mechanism.linear import StateSpace, inverse_mass
 
 Values = Float[np.ndarray, "..."]
-"""Numbers whose shape the docstring tells."""
+"""Array of numbers; the docstrings give the shapes."""
 
 WINDOWS = (11, 21, 31, 41, 61)
 PORTS = {"hub": np.array([1.0, 0.0]), "arm": np.array([1.0, 1.0]), "joint": np.array([0.0, 1.0])}
@@ -26,18 +25,18 @@ PORTS = {"hub": np.array([1.0, 0.0]), "arm": np.array([1.0, 1.0]), "joint": np.a
 
 @dataclass(frozen=True)
 class Motion:
-    """What moved, sample by sample, ends of the smoother cut off.
+    """The motion in a recording, sample by sample, without the ends, where the smoother is less exact.
 
     Attributes:
         u: voltage [V] (N,).
         q, v, a: angles [rad], speeds [rad/s], accelerations [rad/s^2] of (theta, alpha), (N, 2).
         Ts: sampling period [s].
-        joint: the linear joint, fitted to the same recording.
-        mass: its mass matrix [kg m^2] (2, 2).
+        joint: the linear joint, fitted to the training recording.
+        mass: mass matrix of the joint [kg m^2] (2, 2).
         missing: generalised torque that the linear joint does not explain [N m] (N, 2).
-        window: samples of the smoother.
-        start: index of the first sample in the recording.
-        back_emf: voltage that the motor makes per speed of the hub [V s/rad].
+        window: window of the smoother [samples].
+        start: index in the recording of the first sample.
+        back_emf: back-EMF of the motor per speed of the hub [V s/rad].
     """
 
     u: Values
@@ -58,7 +57,7 @@ class Motion:
 
 
 def linear_joint(train: rf.Recording) -> rf.Fit:
-    """The textbook joint, fitted as a predictor, which missing physics bends less than a free run."""
+    """The textbook joint, fitted as a predictor: missing effects bias this fit less than a free-run fit."""
     joint = rf.joints.paper()
     return rf.fit(joint, train, process_noise=dict.fromkeys(joint.port_vectors, 1e-4))
 
@@ -67,8 +66,8 @@ def motion(train: rf.Recording, fit: rf.Fit | None = None) -> Motion:
     """The motion in a recording.
 
     Args:
-        train: theta and alpha [rad].
-        fit: of the linear joint; made here if omitted.
+        train: recording of theta and alpha [rad].
+        fit: fit of the linear joint; computed here if omitted.
     """
     mechanism = (fit or linear_joint(train)).model.mechanism
     joint, inverse = rf.linearise(mechanism), inverse_mass(mechanism)
@@ -82,12 +81,12 @@ def motion(train: rf.Recording, fit: rf.Fit | None = None) -> Motion:
 def motions(
     train: rf.Recording, validation: rf.Recording, fit: rf.Fit | None = None
 ) -> tuple[Motion, Motion]:
-    """The motion in both recordings, under one smoother and one linear joint, those of the training data.
+    """The motion in both recordings, with the smoother and the linear joint of the training data.
 
     Args:
-        train: theta and alpha [rad].
-        validation: what decides.
-        fit: of the linear joint; made here if omitted.
+        train: training recording of theta and alpha [rad].
+        validation: validation recording of theta and alpha [rad].
+        fit: fit of the linear joint; computed here if omitted.
     """
     fit = fit or linear_joint(train)
     m = motion(train, fit)
@@ -100,8 +99,8 @@ def _smoothed(train: rf.Recording, joint: StateSpace, mass: Values, window: int,
         np.asarray(savgol_filter(y, window, 3, deriv=order, delta=Ts, axis=0, mode="interp"), float)
         for order in range(3)
     )
-    # The voltage is held over a sample; at the sample itself it is the mean of before and after. It
-    # goes through the same filter, so that both sides of the balance are smoothed alike.
+    # The voltage is held over a sample; at the sample itself the mean of the values before and after it is
+    # used. The voltage passes the same filter, so that both sides of the balance are smoothed equally.
     held = 0.5 * (u + np.concatenate([u[:1], u[:-1]]))
     smooth = np.asarray(savgol_filter(held, window, 3), float)
     x = np.hstack([q, v])
@@ -124,9 +123,9 @@ def _smoothed(train: rf.Recording, joint: StateSpace, mass: Values, window: int,
 
 
 def _relative_residual(m: Motion) -> float:
-    """Share of the accelerations that a linear balance leaves, after a fit of its own.
+    """Share of the variance of the accelerations that a separately fitted linear balance does not explain.
 
-    What the window takes away from the motion, such as a fast ringing, counts against it.
+    A window that removes motion, such as a fast oscillation, has a larger share.
     """
     columns = np.column_stack([m.q, m.v, m.u, np.ones_like(m.u)])
     left = m.a - columns @ np.linalg.lstsq(columns, m.a, rcond=None)[0]

@@ -1,9 +1,9 @@
-"""A network for the missing torque at hub and joint, learnt through the simulation, then read.
+"""A neural network for the missing torque at hub and joint, trained in simulation, then explained by terms.
 
-The universal differential equation: the linear joint is kept, a small network of angles, speeds and
-voltage adds a torque at hub and joint, short free runs from smoothed states are compared with the
-recording, Adam moves the weights. What the network says over the visited states is then explained by
-the same terms and the same forward selection as the torque balance.
+This is a universal differential equation: the linear joint is kept, and a small network adds a torque at hub
+and joint that depends on angles, speeds and voltage. Short free runs from smoothed states are compared with
+the recording, and Adam updates the weights. The torque of the network along the motion is then explained by
+the same terms and the same forward selection as in the torque balance.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ WIDTH, RUN_SECONDS, STEPS, RATE = 24, 0.5, 1200, 5e-3
 
 
 def neural(train: rf.Recording, validation: rf.Recording) -> NamedEffects:
-    """Learn, then read the learnt torque; what is read from training data must hold on validation data."""
+    """Trains a network on each recording; terms for the torque of the first must also explain the second."""
     m, after = motions(train, validation)
     torque, left = learn(m)
     said = learn(after)[0]
-    # Only samples that are far enough apart to say something new.
+    # Every fifth sample only: neighbouring samples contain nearly the same information.
     thin = slice(None, None, 5)
     unit = np.diag(1 / (np.std(torque, axis=0) + 1e-12))
 
@@ -43,7 +43,7 @@ def neural(train: rf.Recording, validation: rf.Recording) -> NamedEffects:
 
 
 def learn(m: Motion) -> tuple[Values, float]:
-    """The network's generalised torque (N, 2) along the motion, and the share of the error left."""
+    """Generalised torque (N, 2) of the network along the motion, and the remaining share of the error."""
     n = len(m.joint.A)
     push = np.zeros((n, 2))
     push[2:4] = np.linalg.inv(m.mass)

@@ -1,4 +1,4 @@
-"""Effects of the catalogue fitted in turn, the best kept by BIC: forward selection as usual."""
+"""Forward selection with full fits: every effect of the catalogue is fitted in turn, BIC selects the best."""
 
 from __future__ import annotations
 
@@ -11,17 +11,18 @@ from rotflex_jax.mechanism.roles import search_places
 from rotflex_jax.runtime.persistent_jit import clear_compilation_caches
 
 ROUNDS, MARGIN = 2, 5.0
-# After the first round only so many are tried again, those that did best in it: every structure is a program
-# of its own, to be compiled for every pair.
+# Number of the next best effects of a round that are tried in the round after it: every structure is compiled
+# separately, so every pair of effects costs time.
 AGAIN = 6
-# Fits after which compiled programs are dropped.
+# Number of fits after which compiled programs are removed from memory.
 _KEPT = 25
 
 
 def refit(train: rf.Recording, validation: rf.Recording) -> NamedEffects:
     """Forward selection by full refits of the free run.
 
-    An effect is added while BIC on training data falls by enough, and the error on validation data falls.
+    An effect is added if BIC on training data falls by at least twice `MARGIN` and the error on validation
+    data falls.
     """
     model = rf.Model(rf.joints.paper())
     best = rf.fit(model, train)
@@ -39,7 +40,7 @@ def refit(train: rf.Recording, validation: rf.Recording) -> NamedEffects:
             try:
                 fit = rf.fit(best.model + kind(at=port), train)
             except (rf.InputError, ValueError, FloatingPointError):
-                continue  # two of a kind at one place, or a fit that fell over: not a candidate
+                continue  # the model cannot have this effect as well, or the fit failed: not a candidate
             value = _bic(fit, train)
             if np.isfinite(value):
                 trials.append((value, (kind.name, port), fit))
@@ -66,7 +67,7 @@ def _bic(fit: rf.Fit, train: rf.Recording) -> float:
 
 
 def _error(fit: rf.Fit, validation: rf.Recording) -> float:
-    """Sum over channels of the logarithm of the error of short free runs."""
+    """Sum over channels of the logarithm of the mean square error of short free runs."""
     e = (fit.model.measured(validation) - fit.model.simulate_windows(validation, 2.0))[validation.n_init :]
     value = float(np.sum(np.log(np.mean(e**2, axis=0))))
     return value if np.isfinite(value) else np.inf

@@ -1,4 +1,4 @@
-"""Regression of the free-run error on the linear joint's answer to every term."""
+"""Regression of the free-run error on the response of the linear joint to every term."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from rotflex_jax.mechanism.linear import zero_order_hold
 
 
 def residual(train: rf.Recording, validation: rf.Recording) -> NamedEffects:
-    """Forward selection among the answers of the joint to the terms, each along the measured motion.
+    """Forward selection among the responses of the joint to the terms, each along the measured motion.
 
-    The first state of the validation run is its own: what it leaves there is taken out of target and columns.
+    The initial state of each run is unknown: responses to initial states are removed from target and columns.
     """
     fit = linear_joint(train)
     m, after = motions(train, validation, fit)
@@ -41,7 +41,7 @@ def residual(train: rf.Recording, validation: rf.Recording) -> NamedEffects:
 
 
 def _answer(m: Motion, torque: Values) -> Values:
-    """Angles (N, 2) that a generalised torque (N, 2) makes of the linear joint, from rest."""
+    """Angles (N, 2) of the linear joint in response to a generalised torque (N, 2), from rest."""
     push = np.zeros((len(m.joint.A), 2))
     push[2:4] = np.linalg.inv(m.mass)
     A, B = zero_order_hold(m.joint.A, push, m.Ts)
@@ -50,7 +50,7 @@ def _answer(m: Motion, torque: Values) -> Values:
 
 
 def _free(m: Motion, k: int) -> Values:
-    """Angles (N, 2) after a unit of one first state."""
+    """Angles (N, 2) of the free response to a unit initial value of state `k`."""
     A, _ = m.joint.discretise(m.Ts)
     x, out = np.eye(len(A))[:, k], np.empty((len(m.u), 2))
     for row in out:

@@ -1,4 +1,4 @@
-"""Forward selection by BIC among groups of columns, with samples counted as what they are worth."""
+"""Forward selection by BIC among groups of columns, with the effective number of independent samples."""
 
 from __future__ import annotations
 
@@ -13,23 +13,24 @@ from rotflex_jax.arena.rivals.terms import TorqueTerm
 from rotflex_jax.arena.simulator.laws import Place
 from rotflex_jax.effects import CATALOG
 
-# A smoothed residual repeats itself, and its motion is not quite the true one: with nothing hidden up to
-# 25 log-units are gained, with samples discounted for their correlation. A simpler model wins at this share.
+# A smoothed residual is correlated, and the smoothed motion is not exactly the true motion: without a hidden
+# effect the gain reaches 25 nats, even with the effective number of samples. A simpler model is preferred if
+# its gain exceeds this share of the largest gain.
 ROUNDS, MARGIN, PARSIMONY = 3, 30.0, 0.9
 
 
 def rows(signal: Values, scale: Values) -> Values:
-    """(N, 2, k) as rows (2 N, k), the two channels turned and scaled by a matrix (2, 2) first."""
+    """Signal (N, 2, k) as rows (2 N, k), after the matrix `scale` (2, 2) has transformed the two channels."""
     return np.einsum("ij,njk->ink", scale, signal).reshape(-1, signal.shape[2])
 
 
 class Regression(NamedTuple):
-    """What is to be explained, and by what.
+    """Target and columns of a linear regression.
 
     Attributes:
-        target: what is to be explained (rows,).
-        base: columns that are always there (rows, k).
-        columns: those of each candidate, each (rows, k).
+        target: signal to be explained (rows,).
+        base: columns that are in every model (rows, k).
+        columns: columns of each candidate, each (rows, k).
     """
 
     target: Values
@@ -37,24 +38,24 @@ class Regression(NamedTuple):
     columns: Sequence[Values]
 
     def left(self, chosen: Sequence[int], numbers: Values) -> float:
-        """Mean square of what is left with the numbers of a fit to other rows."""
+        """Mean square of the residuals with the given coefficients, which may come from other data."""
         X = np.hstack([self.base, *(self.columns[i] for i in chosen)])
         return float(np.mean((self.target - X @ numbers) ** 2))
 
     def fitted(self, chosen: Sequence[int]) -> Values:
-        """Numbers of the base and of some candidates by least squares."""
+        """Coefficients of the base and of the chosen candidates, by least squares."""
         X = np.hstack([self.base, *(self.columns[i] for i in chosen)])
         size = np.maximum(np.linalg.norm(X, axis=0), 1e-30)
         return np.linalg.lstsq(X / size, self.target, rcond=1e-10)[0] / size
 
 
 def select(train: Regression, validation: Regression, candidates: Sequence[TorqueTerm]) -> NamedEffects:
-    """Adds the group that lowers BIC most on training data, while that lowers the error on validation data.
+    """Adds the group that lowers BIC most on training data, as long as the error on validation data falls.
 
     Args:
-        train: fitted.
-        validation: decides how many groups are kept.
-        candidates: what the groups stand for.
+        train: regression on training data, which is fitted.
+        validation: regression on validation data, which determines how many groups are kept.
+        candidates: terms to which the groups of columns belong.
     """
     target, base, columns = train
     base = base / np.maximum(np.linalg.norm(base, axis=0), 1e-30)
@@ -84,7 +85,7 @@ def select(train: Regression, validation: Regression, candidates: Sequence[Torqu
         gain, best, direction = max(trials, key=lambda t: t[0])
         if gain < MARGIN:
             break
-        # The rule of parsimony that the search itself keeps: a simpler model that says nearly as much.
+        # The rule of parsimony of the search: a simpler model is preferred if its gain is nearly the same.
         simpler = [
             t
             for t in trials
@@ -107,7 +108,7 @@ def select(train: Regression, validation: Regression, candidates: Sequence[Torqu
 
 
 def _independent(e: Values) -> float:
-    """How many independent samples a correlated sequence is worth, from its correlation time."""
+    """Effective number of independent samples of a correlated sequence, from its correlation time."""
     e = e - e.mean()
     n = len(e)
     spectrum = np.abs(np.fft.rfft(e, 2 * n)) ** 2

@@ -1,9 +1,9 @@
-"""The named effects as columns of torque over a motion.
+"""The effects as columns of generalised torques along a motion.
 
-What has a state of its own (hysteresis, a lag, another mode, a warm motor) enters by that state along the
-measured motion and voltage. An error ``d(q)`` of a sensor enters by what the balance of the joint makes of
-it, ``M d'' - M A (d, d')``. Only play in the gear, whose rotor nobody sees while it flies, and a voltage that
-drifts have no column.
+An effect with a state of its own (hysteresis, a lag, a second mode, heating of the motor) enters with this
+state, computed along the measured motion and voltage. An error ``d(q)`` of a sensor enters as the torque that
+it causes in the balance of the joint, ``M d'' - M A (d, d')``. Two effects have no columns: play in the gear,
+since the motion of the rotor out of contact is not measured, and a drift of the voltage.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ LATE = (0.002, 0.0045, 0.01)
 LAGS = (0.003, 0.006, 0.012)
 COOLING = (10.0, 30.0, 90.0)
 MODES = {"hub": (12.0, 18.0, 25.0), "arm": (7.0, 10.0, 14.0)}
-# Common to all shapes of an effect: Bouc and Wen's beta, the rise of LuGre's friction at rest, damping ratio.
+# Equal for all shapes of an effect: beta of Bouc-Wen, rise of LuGre's friction at rest, damping ratio.
 BETA, RISE, DAMPING = 0.5, 0.5, 0.03
 
 
@@ -38,8 +38,8 @@ class TorqueTerm(NamedTuple):
 
     Attributes:
         place: name and port.
-        columns: (N, 2, k) shapes of the torque on (theta, alpha), one per number to be fitted.
-        shape: the parameters that are fixed by it, for the reader.
+        columns: (N, 2, k) shapes of the torque on (theta, alpha), one for each coefficient to be fitted.
+        shape: values of the fixed parameters, as text.
     """
 
     place: Place
@@ -48,17 +48,17 @@ class TorqueTerm(NamedTuple):
 
 
 def terms(m: Motion, accelerations: bool = True) -> list[TorqueTerm]:
-    """All terms over a motion, several shapes of an effect as terms of their own.
+    """All terms along a motion; each shape of an effect is a separate term.
 
     Args:
         m: the motion.
-        accelerations: whether terms may hold accelerations; not where these are what is to be explained.
+        accelerations: whether terms may contain accelerations; False if accelerations are to be explained.
     """
     return [*_at_ports(m), *_of_modes(m), *_of_voltage(m), *_of_sensors(m, accelerations)]
 
 
 def linear_columns(m: Motion) -> Values:
-    """(N, 2, k) torques of the joint's own linear terms, for their share of what is missing."""
+    """Torques (N, 2, k) of the linear terms of the joint, which may explain a part of the missing torque."""
     hub, joint = PORTS["hub"], PORTS["joint"]
     own = [
         np.outer(m.at("hub")[1], hub),
@@ -111,7 +111,7 @@ def _at_ports(m: Motion) -> Iterator[TorqueTerm]:
 
 
 def _of_modes(m: Motion) -> Iterator[TorqueTerm]:
-    """A mass on a spring at a port, which its own acceleration shakes: ``e'' + d e' + k e = -z''``.
+    """A mass on a spring at a port, excited by the acceleration of the port: ``e'' + d e' + k e = -z''``.
 
     The torque on the port is the mass times its acceleration ``z'' + e'' = -d e' - k e``.
     """
@@ -122,7 +122,7 @@ def _of_modes(m: Motion) -> Iterator[TorqueTerm]:
             k, d = w**2, 2 * DAMPING * w
             A, B = np.array([[0.0, 1.0], [-k, -d]]), np.array([[0.0], [-1.0]])
             mass = (A, B, A[1:], np.zeros((1, 1)))
-            # At first it hangs behind as far as its spring gives under that acceleration.
+            # The initial deflection is the equilibrium of the spring under the first acceleration.
             start = np.array([-shaking[0, 0] / k, 0.0])
             answer = dlsim(cont2discrete(mass, m.Ts, "zoh"), shaking, x0=start)[1]
             yield _term(("second_mode", port), port, answer[:, 0], note=f"{frequency:g} Hz")
@@ -135,13 +135,13 @@ def _of_voltage(m: Motion) -> Iterator[TorqueTerm]:
         late = np.interp(t - time, t, u) - u
         yield _term(("delay", "input"), "hub", late, note=f"{1e3 * time:g} ms")
     for time in LAGS:
-        # Exact for a voltage that runs straight from sample to sample.
+        # Exact for a voltage that is linear between samples.
         keep = np.exp(-m.Ts / time)
         slope = (1 - keep) * time / m.Ts
         b, a = np.array([1 - slope, slope - keep]), np.array([1.0, -keep])
         behind = lfilter(b, a, u, zi=u[0] * lfilter_zi(b, a))[0] - u
         yield _term(("lag", "input"), "hub", behind, note=f"{1e3 * time:g} ms")
-    # Torque of the cold motor per volt at rest; warmth takes a share of it.
+    # Torque of the cold motor, in volts at rest; heating reduces the torque.
     cold = u - m.back_emf * m.v[:, 0]
     for time in COOLING:
         keep = np.exp(-m.Ts / time)
@@ -154,7 +154,7 @@ def _of_voltage(m: Motion) -> Iterator[TorqueTerm]:
 
 
 def _of_sensors(m: Motion, accelerations: bool) -> Iterator[TorqueTerm]:
-    """Errors of a reading: what the joint would have to feel for the wrong angle to be the true one."""
+    """Errors of a reading, as the torques that the joint would need if the wrong angles were true."""
 
     def term(name: str, channel: int, *errors: tuple[Values, Values, Values]) -> TorqueTerm:
         unit = np.eye(2)[channel]
@@ -185,8 +185,9 @@ def _of_sensors(m: Motion, accelerations: bool) -> Iterator[TorqueTerm]:
 def _hysteresis(v: Values, level: Values, width: float, release: float, Ts: float) -> Values:
     """State along a measured motion of ``x' = v / width - part |v| / (width level) x``.
 
-    `part` is one while the torque builds up and `release` while it goes back: one for Dahl's, whose level
-    is one, and for LuGre's, whose level depends on the speed; ``2 beta - 1`` for Bouc and Wen's.
+    `part` is one while the torque builds up, and `release` while it decreases. For Dahl's law `release` and
+    `level` are one; for LuGre's law `release` is one and `level` depends on the speed; for the Bouc-Wen law
+    `release` is ``2 beta - 1``.
     """
     x, out = 0.0, np.empty_like(v)
     step = np.abs(v) * Ts / width

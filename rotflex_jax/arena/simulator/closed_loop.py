@@ -1,7 +1,7 @@
-"""Recordings as a laboratory makes them: a controller in the loop, which sees what the sensors tell.
+"""Recordings in closed loop: the controller uses the readings of the sensors.
 
-The voltage that is recorded is the one that the controller held over the sample; the plant moves in steps of
-20 us (`simulator.plant`).
+The recorded voltage is the voltage that the controller holds over the sample; the plant is integrated in
+steps of 20 us (`simulator.plant`).
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ COUNT = 2 * np.pi / 4096
 
 @dataclass(frozen=True)
 class Sensors:
-    """What is between the angles and the recording, beside the errors that the plant's laws name.
+    """Quantisation, noise and further errors of the sensors, in addition to the sensor errors in `Laws`.
 
     Args:
         resolution: one count of theta and of alpha [rad].
-        noise: standard deviation ahead of the counter [rad].
-        modes: how much of the deflection of the oscillators at hub and arm alpha shows.
-        crosstalk: share of theta in alpha.
-        late: samples that alpha comes late.
+        noise: standard deviation of the noise before quantisation [rad].
+        modes: shares of the deflections of the oscillators at hub and arm in the reading of alpha.
+        crosstalk: share of theta in the reading of alpha.
+        late: delay of the reading of alpha [samples].
     """
 
     resolution: tuple[float, float] = (COUNT, COUNT)
@@ -48,14 +48,14 @@ class Sensors:
     late: int = 0
 
     def deviation(self) -> Values:
-        """Standard deviation of noise and counting together [rad], ``(2,)``."""
+        """Standard deviation of noise and quantisation together [rad], ``(2,)``."""
         return np.sqrt(np.square(self.noise) + np.square(self.resolution) / 12)
 
     def clean(self, states: Values, table: Values) -> Values:
-        """Readings without noise and counting [rad], ``(N, 2)``.
+        """Readings without noise and quantisation [rad], ``(N, 2)``.
 
         Args:
-            states: rows of `simulator.plant.run`.
+            states: states of the plant, rows as in `simulator.plant.run`.
             table: errors of the sensors, as in `simulator.tables.Laws`.
         """
         course = course_of(states)
@@ -73,7 +73,7 @@ class Sensors:
         return y
 
     def measured(self, clean: Values, noise: Values) -> Values:
-        """What is recorded [rad]; `noise` is standard normal and of the same shape."""
+        """Recorded angles [rad]; `noise` is standard normal, with the shape of `clean`."""
         step = np.asarray(self.resolution)
         return step * (np.round((clean + np.asarray(self.noise) * noise) / step) + 0.0)
 
@@ -85,11 +85,11 @@ class Loop:
     Args:
         u: voltage that the controller held over each sample [V], ``(N,)``.
         y: recorded angles [rad], ``(N, 2)``.
-        clean: the same without noise and counting.
+        clean: readings without noise and quantisation [rad], ``(N, 2)``.
         states: whole state of the plant at each sample, as `simulator.plant.run` gives it.
-        torque: what pushed the motor besides [N m], ``(N,)``.
-        reference: [rad], ``(N,)``.
-        first: samples that went before, since the plant was at rest at zero.
+        torque: disturbance torque added to the motor torque [N m], ``(N,)``.
+        reference: reference of the controller [rad], ``(N,)``.
+        first: number of samples from the start at rest to the first sample of this run.
     """
 
     u: Values
@@ -141,13 +141,13 @@ def recorded(
 
     Args:
         plant: physical constants.
-        laws: what acts besides them.
-        sensors: what the controller and the recording see.
-        controller: feedback, its voltage limited to `simulator.control.LIMIT`.
-        reference: wanted angle [rad], ``(N,)``.
+        laws: effects in addition to these constants.
+        sensors: sensors of the controller and of the recording.
+        controller: feedback; its voltage is limited to `simulator.control.LIMIT`.
+        reference: reference of the controller [rad], ``(N,)``.
         Ts: sampling period [s].
-        rng: noise of the sensors.
-        torque: what pushes the motor besides [N m], ``(N,)``, held over each sample.
+        rng: random generator for the noise of the sensors.
+        torque: disturbance torque added to the motor torque [N m], ``(N,)``, held over each sample.
         step: longest integration step [s].
     """
     N, substeps = reference.size, max(1, round(Ts / step))
@@ -162,7 +162,7 @@ def recorded(
     states, u, clean, y = np.empty((N, x.size)), np.empty(N), np.empty((N, 2)), np.empty((N, 2))
     for n in range(N):
         states[n] = x
-        # A late reading needs the samples before it.
+        # A delayed reading needs earlier samples.
         clean[n] = sensors.clean(states[max(0, n - sensors.late) : n + 1], laws.sensors)[-1]
         y[n] = sensors.measured(clean[n], noise[n])
         wanted = k[0] * reference[n] - k[:2] @ y[n] - k[2:] @ rates(y[n])

@@ -1,7 +1,7 @@
-"""Compiled functions that are kept between runs until any file of the simulator changes.
+"""Compiled functions that are cached between runs until any file of the simulator changes.
 
-Numba looks only at the file of a function to see whether its kept code is out of date, and this
-simulator calls across files.
+Numba checks only the file of a function to decide whether its cached code is out of date, but functions of
+this simulator call functions in other files.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import TypeVar, cast
 try:
     import numba
     from numba.core import config
-except ImportError as error:  # whoever looks for mistakes in the input gets a sentence
+except ImportError as error:  # with a readable message
     raise ImportError(
         'The simulator of the arena needs numba; run pip install "rotflex_jax[arena]".'
     ) from error
@@ -24,20 +24,20 @@ except ImportError as error:  # whoever looks for mistakes in the input gets a s
 F = TypeVar("F", bound=Callable)
 
 _HERE = Path(__file__).parent
-# The files with compiled functions, and the columns that they have built in.
+# Files with compiled functions, and the file with the numbers of columns that these functions use.
 _FILES = [file.read_bytes() for file in sorted(_HERE.glob("*.py"))]
 _SOURCES = b"".join(text for text in _FILES if b"@compiled" in text or b"class Tables" in text)
 _DIGEST = hashlib.sha256(_SOURCES).hexdigest()[:12]
-# An installed package may lie where its user cannot write.
+# The user may not be allowed to write into the folder of an installed package.
 _OWN, _HOME = _HERE / "__pycache__", Path.home() / ".cache" / "rotflex_jax" / "arena"
 _FOLDER = (_OWN if os.access(_OWN if _OWN.is_dir() else _HERE, os.W_OK) else _HOME) / _DIGEST
 _SETTING = "CACHE_DIR"
 
 
 def compiled(function: F) -> F:
-    """The function, compiled at its first call or taken from an earlier run.
+    """The function, compiled at its first call or loaded from an earlier run.
 
-    What checks types around it, where a test asks for that, is left out: it cannot be compiled.
+    A wrapper that checks types, which tests can add, is removed first: it cannot be compiled.
     """
     previous = getattr(config, _SETTING)
     setattr(config, _SETTING, str(_FOLDER))

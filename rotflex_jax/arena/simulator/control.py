@@ -1,7 +1,7 @@
 r"""Controllers and references of a laboratory: PD on one of two angles or LQR, gains from the textbook model.
 
-A controller sees readings of both angles, differentiates them by a first-order filter and asks for
-:math:`v = k_r r - k \cdot (\theta, \alpha, \dot\theta, \dot\alpha)`, limited to what the amplifier gives.
+A controller reads both angles, differentiates them with a first-order filter and applies
+:math:`v = k_r r - k \cdot (\theta, \alpha, \dot\theta, \dot\alpha)`, limited to `LIMIT`.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from rotflex_jax.arena.simulator.plant import Plant
 from rotflex_jax.arena.simulator.tables import Values
 
 LIMIT = 10.0
-"""Largest voltage that a controller may ask for [V]."""
+"""Largest voltage that a controller may apply [V]."""
 
 KINDS = ("pd_theta", "pd_tip", "lqr")
 
-# The slowest pole that a designer accepts on the textbook model [1/s], and the least damping ratio.
+# Smallest decay rate [1/s] and smallest damping ratio of the poles that a designer accepts.
 SLOWEST, DAMPING = 1.5, 0.08
 
 
@@ -30,7 +30,7 @@ class Controller:
     Args:
         kind: a member of `KINDS`.
         gains: of theta, alpha, theta', alpha' [V/rad, V s/rad].
-        corner: frequency of the filter that differentiates [Hz].
+        corner: corner frequency of the filter that differentiates [Hz].
     """
 
     kind: str
@@ -39,7 +39,7 @@ class Controller:
 
 
 def textbook(plant: Plant) -> tuple[Values, Values]:
-    """Matrices of ``x' = A x + b v`` with ``x = (theta, alpha, theta', alpha')``, no other law."""
+    """Matrices of ``x' = A x + b v`` with ``x = (theta, alpha, theta', alpha')``, without other effects."""
     g = plant.torque_per_volt
     damper = plant.B_hub + g * plant.k_m * plant.K_g
     # In theta: J_h th'' = g v - d th' + K al + B al'; in the arm: J_a (th'' + al'') = -K al - B al'.
@@ -53,7 +53,7 @@ def textbook(plant: Plant) -> tuple[Values, Values]:
 
 
 def _accepted(plant: Plant, controller: Controller) -> bool:
-    """Whether the loop on the textbook model, filters included, is fast and damped enough."""
+    """Whether the closed loop of the textbook model, filters included, is fast and damped enough."""
     A, b = textbook(plant)
     k, w = np.array(controller.gains), 2 * np.pi * controller.corner
     # A filtered rate: s' = w (y' - s) = w (x_rate - s).
@@ -66,7 +66,7 @@ def _accepted(plant: Plant, controller: Controller) -> bool:
 
 
 def designed(kind: str, plant: Plant, rng: np.random.Generator) -> Controller:
-    """A controller of this kind for the textbook model, its speed drawn at random.
+    """A controller of this kind for the textbook model, with random gains (PD) or weights (LQR).
 
     Args:
         kind: a member of `KINDS`.

@@ -1,4 +1,4 @@
-"""Several effects in one machine: pairs and triples, drawn once and for all."""
+"""Several effects in one machine: pairs and triples, from a fixed random draw."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ _FRICTION = {"coulomb", "coulomb_asymmetric", "stribeck", "dahl", "lugre", "bouc
 
 
 def apart(a: Place, b: Place) -> bool:
-    """Whether two effects are two: no look-alikes, no two frictions of one port, no two of one name."""
+    """Whether two effects may act together: not equivalent, not two frictions at a port, not of one name."""
     alike = b in EQUIVALENT.get(a, set()) or a in EQUIVALENT.get(b, set())
     same_friction = a[1] == b[1] and a[0] in _FRICTION and b[0] in _FRICTION
     return a[0] != b[0] and not alike and not same_friction
@@ -23,8 +23,8 @@ def drawn(count: int, together: int) -> list[tuple[Place, ...]]:
     The order of the draw is fixed, so that a longer list begins with the shorter one.
 
     Args:
-        count: groups.
-        together: effects in each.
+        count: number of groups.
+        together: number of effects in each group.
 
     >>> drawn(2, 2) == drawn(3, 2)[:2]
     True

@@ -64,9 +64,9 @@ def sweep(
     band: tuple[float, float] = (0.1, 12.0),
     period: float = 5.0,
 ) -> Signal:
-    """Sine of amplitude sqrt(2) V, its frequency exponentially up and down `band` every `period`.
+    """Sine of amplitude sqrt(2) V; its frequency rises and falls exponentially within `band` every `period`.
 
-    It repeats, so that the last part of a record holds every frequency too.
+    The sweep repeats, so that the last part of a record also contains every frequency.
     """
     t = np.arange(N) / fs
     ramp = 1 - np.abs(1 - 2 * ((t / period + rng.random()) % 1))

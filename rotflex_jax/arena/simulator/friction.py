@@ -1,4 +1,4 @@
-"""Dry friction as the set-valued law it is: a port at rest stays there while the interval holds it.
+"""Dry friction as a set-valued law: a port stays at rest while a torque within the interval can hold it.
 
 Source: J. J. Moreau, Unilateral contact and dry friction (1988).
 """
@@ -21,7 +21,7 @@ from rotflex_jax.arena.simulator.tables import (
     Values,
 )
 
-# Sweeps of the contact solver; the slowest case (all three ports stuck) needs about 100.
+# Largest number of sweeps of the contact solver; the slowest case (all three ports stuck) needs about 100.
 SWEEPS = 1000
 
 
@@ -45,10 +45,10 @@ def interval(c, z, s, h, low, high):
 
 @compiled
 def stick_or_slip(w1, w2, low, high, impulse, J_hub, J_arm):
-    """Friction impulses of one step and the speeds they leave, by projected Gauss-Seidel.
+    """Friction impulses of one step and the speeds after them, by projected Gauss-Seidel.
 
-    At every port the impulse stops the motion if the interval [low, high] allows it, and sits on
-    the end that opposes the motion otherwise. `impulse` holds the guess and receives the answer.
+    At every port the impulse stops the motion if the interval [low, high] allows it; otherwise it is the end
+    of the interval that opposes the motion. `impulse` holds the initial guess and receives the result.
     """
     w1 += (impulse[HUB] - impulse[JOINT]) / J_hub
     w2 += (impulse[ARM] + impulse[JOINT]) / J_arm

@@ -1,7 +1,7 @@
-"""Play between motor and hub: two inertias that are either one or apart.
+"""Play between motor and hub: two inertias that are either in contact or apart.
 
-The rotor pushes the hub at one end of the play or the other and never pulls. They meet without
-bouncing: at that instant both take on the speed that their common momentum gives.
+The rotor pushes the hub at one end of the play or at the other, and never pulls it. The impact is inelastic:
+afterwards both have the same speed, which conserves their momentum.
 
 Source: F. Pfeiffer and C. Glocker, Multibody Dynamics with Unilateral Contacts (1996), chapter 6,
 for the two states of a contact and what ends them.
@@ -16,9 +16,9 @@ from rotflex_jax.arena.simulator.motion import R_ANGLE, R_SPEED, ROTOR, THETA, W
 from rotflex_jax.arena.simulator.tables import GEAR_PLAY, HUB
 
 ROTOR_SHARE = 0.8
-"""Part of the hub's inertia that is the rotor's."""
+"""Share of the rotor in the inertia of the hub."""
 
-# Contacts and releases within one integration step; more than two are rounding.
+# Largest number of contacts and releases within one integration step; more than two come from rounding.
 CHANGES = 6
 
 
@@ -26,11 +26,11 @@ CHANGES = 6
 def touch(gap, rate, end_rate, wall, h):
     """Time at which a gap reaches a wall that it has passed by the end of a step.
 
-    Its acceleration is constant over the step, as the midpoint rule has it.
+    The acceleration of the gap is constant over the step, as in the midpoint rule.
     """
     a, distance = (end_rate - rate) / (2 * h), wall - gap
     root = np.sqrt(max(rate * rate + 4 * a * distance, 0.0))
-    # The form without cancellation: rate and root have the sign of the way to go.
+    # This form of the solution has no cancellation: `way` is the sign of the motion towards the wall.
     way = 1.0 if distance > 0 or (distance == 0 and wall > 0) else -1.0
     below = rate + way * root
     if way * below <= 0.0:
@@ -40,20 +40,20 @@ def touch(gap, rate, end_rate, wall, h):
 
 @compiled
 def geared_step(x, new, side, drive, t, h, tables, space):
-    """A step with play in the gear; `x` receives the state.
+    """A step with play in the gear.
 
     Args:
-        x: state.
-        new: memory of the same size.
+        x: state at the start; receives the state at the end.
+        new: work array of the same size.
         side: 1 if the rotor is ahead and touches, -1 if it is behind and touches, 0 if apart.
-        drive: torque of the cold motor at rest.
-        t: time at the start.
-        h: length of the step.
+        drive: torque of the cold motor at rest [N m].
+        t: time at the start [s].
+        h: length of the step [s].
         tables: `simulator.tables.Tables`.
         space: `simulator.motion.Space`.
 
     Returns:
-        The side at the end.
+        `side` at the end.
     """
     half = 0.5 * tables.motor[GEAR_PLAY]
     share = tables.J[ROTOR] / tables.J[HUB]

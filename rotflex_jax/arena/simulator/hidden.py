@@ -1,4 +1,4 @@
-"""The effects that a recording may hide: their names, ports, default sizes and look-alikes."""
+"""The effects that a recording may hide: their names, ports, default sizes and equivalent effects."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ DEFAULTS: dict[Place, dict[str, float]] = {
 """Parameters at ``size = 1``: N m, N m s/rad, N m s^2/rad^2, N m/rad^2, N m/rad^3, rad, rad/s, V, s,
 Hz, kg m^2, 1/rad^2; heat in 1/((N m)^2 s).
 
-A bias of `theta` is left out: it shifts an origin that nobody knows.
+A bias of `theta` is left out: it only shifts an unknown origin.
 """
 
 OUTSIDE: dict[Place, dict[str, float]] = {
@@ -74,12 +74,12 @@ OUTSIDE: dict[Place, dict[str, float]] = {
     ("slack_cable", "hub"): {"level": 0.05, "width": 0.1, "time": 0.3},
     ("worm", "hub"): {"loss": 0.5, "speed": 1.5},
 }
-r"""Effects that the package has nothing for: an honest search says that something is missing.
+r"""Effects that are not in the catalogue of the package: a good search reports that an effect is missing.
 
-Friction of level ``F (1 + r sin 3 theta)``; a stiffness that grows by 1 %
-per second; a torque ``A sin 2 pi f t`` that nobody measures; a cable that takes a torque over an angle
-and lets it fade while it rests, ``x' = (s - |s| x) / w - x / T``; a gear that passes on less at speed,
-``1 - loss |s| / (|s| + s_0)`` of the motor torque.
+Friction of level ``F (1 + r sin 3 theta)``; a stiffness that grows by 1 % per second; a torque
+``A sin 2 pi f t`` that is not measured; a cable whose torque builds up over an angle and decays at rest,
+``x' = (s - |s| x) / w - x / T``; a gear that transmits less at high speed, ``1 - loss |s| / (|s| + s_0)`` of
+the motor torque.
 """
 
 EQUIVALENT: dict[Place, set[Place]] = {
@@ -95,29 +95,30 @@ EQUIVALENT: dict[Place, set[Place]] = {
     ("sensor_gain", "alpha"): {("sensor_gain", "theta")},
     ("sensor_gain", "theta"): {("sensor_gain", "alpha")},
 }
-r"""Answers that no recording can tell from the truth, alone or together with the symmetric form.
+r"""Answers that no recording can distinguish from the truth, alone or together with symmetric friction.
 
-With mean level ``F`` and half difference ``d`` an asymmetric friction is ``F Sgn(s) + d``, a
-symmetric one and a constant torque ``d``. At the hub that torque is a voltage ``-d / g``. At the
-joint it moves the equilibrium by ``-d / K``, and every law sees only motion about it, so it is a
-bias of the deflection sensor. At the arm, ``p = (1, 1)``, it is both. The identities are exact
-while no other effect depends on what is shifted (dead zone, spring of higher order).
+With mean level ``F`` and half difference ``d``, asymmetric friction is ``F Sgn(s) + d``: symmetric friction
+and a constant torque ``d``. At the hub this torque is equivalent to a voltage ``-d / g``. At the joint it
+moves the equilibrium by ``-d / K``, and every law depends only on the motion about it, so it is equivalent to
+a bias of the deflection sensor. At the arm, ``p = (1, 1)``, it is equivalent to both together. This is exact
+while no other effect depends on the shifted quantity (dead zone, nonlinear spring).
 
-Of two sensor gains only the ratio counts: readings that are both too large by one factor are those
-of a stronger motor. Exact while every torque is in proportion to angles, speeds and voltage.
+Only the ratio of the two sensor gains can be identified: two readings that are too large by the same factor
+are the readings of a joint with a stronger motor. This is exact while every torque is proportional to angles,
+speeds and voltage.
 
-A law that holds the truth as a special case is no look-alike but a needless parameter: Bouc and
-Wen's with ``beta = 1`` is Dahl's, LuGre's with no rise and no damping too.
+A law that contains the true law as a special case is not listed, since it has a needless parameter: the
+Bouc-Wen law with ``beta = 1`` is Dahl's law, and so is LuGre's law without rise and damping.
 """
 
 ABSORBED: set[Place] = {("viscous", "hub"), ("viscous", "joint")}
-"""Effects that only enlarge a constant which the textbook joint already has free."""
+"""Effects that only enlarge a free constant of the textbook joint."""
 
 UNSEEN: dict[Place, set[str]] = {
     ("dead_zone", "input"): {"prbs"},
     ("saturation", "input"): {"prbs"},
 }
-"""Inputs that cannot show an effect: on two levels these two are a change of gain."""
+"""Inputs that cannot show an effect: with two levels of voltage, these two effects only change the gain."""
 
 SHAPES: dict[str, set[str]] = {
     "stribeck": {"speed"},
@@ -135,7 +136,7 @@ SHAPES: dict[str, set[str]] = {
 }
 """Parameters that keep their value when the size of an effect is scaled."""
 
-# A limit bites harder when lower.
+# Parameters with a stronger effect at a smaller value.
 _INVERSE = {"limit"}
 
 

@@ -66,7 +66,7 @@ _HYSTERESIS: dict[str, dict[str, int]] = {
 
 
 def _entry(effect: str, name: str, value: float) -> float:
-    """The coefficient that a parameter stands for: rates of times and of frequencies."""
+    """Coefficient for a parameter: times become rates, frequencies become angular frequencies."""
     if (effect, name) in {("heating", "time"), ("slack_cable", "time")}:
         return 1 / value
     if (effect, name) == ("shaking", "frequency"):
@@ -84,9 +84,10 @@ def _row(effect: str, port: str, values: Mapping[str, float]) -> np.ndarray:
 
 
 def laws(effects: Mapping[Place, Mapping[str, float]]) -> Laws:
-    """The plant's coefficient tables with the given effects in them.
+    """The plant's coefficient tables with the given effects.
 
-    Effects of one kind at one port add up, friction levels included; a limit replaces.
+    Coefficients that several effects share, such as friction levels at a port, add up; a limit replaces the
+    default.
 
     Args:
         effects: parameters of every effect by name and port.

@@ -22,7 +22,7 @@ class Machine:
         plant: physical constants.
         hidden: parameters of every effect by name and port, as in `simulator.laws.laws`.
         Ts: sampling period [s].
-        seed: of the jitter of the encoders.
+        seed: seed of the noise of the encoders.
     """
 
     def __init__(self, plant: Plant, hidden: Mapping[Place, Mapping[str, float]], Ts: float, seed: int = 0):
@@ -38,18 +38,18 @@ class Machine:
 
     @classmethod
     def of(cls, record: Mapping[str, Any], seed: int = 0) -> Machine:
-        """The machine that a record of `simulator.records.make_record` was taken from."""
+        """The machine of a record from `simulator.records.make_record`."""
         truth = record["truth"]
         hidden = {(e["effect"], e["port"]): e["parameters"] for e in truth["effects"]}
         return cls(Plant(**truth["plant"]), hidden, record["Ts"], seed)
 
     def read(self) -> Values:
-        """Angles as the encoders report them [rad], ``(2,)``."""
+        """Readings of the encoders [rad], ``(2,)``."""
         clean = read(self.x[None, :2], self.errors)[0]
         return COUNT * (np.round((clean + JITTER * self.noise.standard_normal(2)) / COUNT) + 0.0)
 
     def advance(self, voltage: float) -> None:
-        """Hold a voltage [V] over one sample."""
+        """Holds a voltage [V] over one sample."""
         self.states.append(self.x.copy())
         drive = self.gain * self.path(float(voltage))
         first = self.samples * self.substeps

@@ -25,22 +25,22 @@ from rotflex_jax.arena.simulator.torques import build_up, of_the_moment, oscilla
 
 ROTOR = 2
 
-# The state: angles of hub and of the arm against it, absolute speeds of both, warmth of the motor,
-# angle and speed of its rotor, then of two oscillators; hysteretic torques follow.
+# State: angle of the hub, angle of the arm relative to the hub, absolute speeds of both, relative rise of the
+# motor resistance, angle and speed of the rotor and of two oscillators; states of hysteretic torques follow.
 THETA, ALPHA, W_HUB, W_ARM, HEAT, R_ANGLE, R_SPEED, MODES = 0, 1, 2, 3, 4, 5, 6, 7
 MEMORY = 11
 
 
 class Space(NamedTuple):
-    """Memory that a step works in, one entry per port.
+    """Work arrays of a step, with one entry per port.
 
     Attributes:
-        z: positions halfway.
-        s: speeds halfway.
+        z: positions at the middle of the step.
+        s: speeds at the middle of the step.
         f: torques.
-        low: least friction impulse.
+        low: smallest friction impulse.
         high: largest friction impulse.
-        impulse: friction impulse of the last step, where the next one begins to search.
+        impulse: friction impulse of the last step, which is the initial guess for the next step.
     """
 
     z: Values
@@ -53,11 +53,11 @@ class Space(NamedTuple):
 
 @compiled
 def motor(drive, speed, heat, h, emf, m):
-    """Torque of the motor and its warmth after a step; `drive` is the torque at rest when cold."""
+    """Motor torque, and heating after a step; `drive` is the torque of the cold motor at rest."""
     cold = drive - emf * speed
     torque = cold / (1 + heat)
     if m[HEAT_RATE] != 0.0:
-        # Midpoint rule; the torque of the middle is that of half the warming.
+        # Midpoint rule: the torque is taken at the heating in the middle of the step.
         mid = heat
         for _ in range(2):
             torque = cold / (1 + mid)
@@ -70,15 +70,15 @@ def motor(drive, speed, heat, h, emf, m):
 
 @compiled
 def step(x, new, drive, t, h, engaged, tables, space):
-    """Writes the state after a step into `new`; answers the torque that the gear carried.
+    """Writes the state after a step into `new`, and returns the torque that the gear transmits.
 
     Args:
         x: state at the start.
-        new: state at the end.
-        drive: torque of the cold motor at rest.
-        t: time halfway.
-        h: length of the step.
-        engaged: whether hub and rotor turn as one; if not, the rotor turns alone.
+        new: receives the state at the end.
+        drive: torque of the cold motor at rest [N m].
+        t: time at the middle of the step [s].
+        h: length of the step [s].
+        engaged: whether hub and rotor turn together; if not, the rotor turns alone.
         tables: `simulator.tables.Tables`.
         space: `Space`.
     """
@@ -90,7 +90,7 @@ def step(x, new, drive, t, h, engaged, tables, space):
     w1, w2 = x[W_HUB], x[W_ARM]
     n1, n2, at_motor = w1, w2, 0.0
     new[R_SPEED] = x[R_SPEED]
-    # Two passes make it second order, and h is far below any 1/rate.
+    # Two passes give second order, and `h` is much shorter than every time constant.
     for _ in range(2):
         m1, m2 = 0.5 * (w1 + n1), 0.5 * (w2 + n2)
         a, b = x[THETA] + 0.5 * h * m1, x[ALPHA] + 0.5 * h * (m2 - m1)
@@ -111,7 +111,7 @@ def step(x, new, drive, t, h, engaged, tables, space):
         if engaged:
             pushed = drive
             if not plain:
-                # The torque table has the back-EMF of the cold motor.
+                # The torque table contains the back-EMF of the cold motor.
                 at_motor, new[HEAT] = motor(drive, m1, x[HEAT], h, tables.emf, m)
                 pushed = at_motor + tables.emf * m1
         else:

@@ -7,9 +7,9 @@ Hub angle `theta`, arm angle relative to the hub `alpha`. In the absolute speeds
     J_h \dot w_1 = g\, v + f_{hub} - f_{joint}, \qquad
     J_a \dot w_2 = f_{arm} + f_{joint}, \qquad g = \eta k_t K_g / R_m,
 
-and each of the three ports carries the laws of `simulator.tables`. The voltage passes `simulator.voltage`
-before it reaches the motor; back-EMF is a damper of ``g k_m K_g`` at the hub, or at the rotor
-while play in the gear (`simulator.gear`) keeps it apart.
+and the torque at each of the three ports follows the laws of `simulator.tables`. The voltage passes
+`simulator.voltage` before it reaches the motor. The back-EMF is a damper of ``g k_m K_g`` at the hub, or at
+the rotor while play in the gear (`simulator.gear`) separates rotor and hub.
 """
 
 from __future__ import annotations
@@ -77,11 +77,11 @@ class Plant:
 
 
 class Course(NamedTuple):
-    """All that the plant went through; every row is the start of a sample.
+    """All states of the plant; every row belongs to the start of a sample.
 
     Attributes:
         motion: ``theta, alpha, theta', alpha'``, ``(N, 4)``.
-        rotor: angle and speed of the rotor, ``(N, 2)``; the hub's own without play in the gear.
+        rotor: angle and speed of the rotor, ``(N, 2)``; without play in the gear equal to those of the hub.
         heat: relative rise of the armature's resistance, ``(N,)``.
         modes: angle and speed of the oscillators at hub and arm, ``(N, 4)``.
         memory: normalised hysteretic torques in the order of their rows, ``(N, rows)``.
@@ -96,26 +96,26 @@ class Course(NamedTuple):
 
 @compiled
 def working_space():
-    """Memory of `simulator.motion.step`, friction impulses at zero."""
+    """Work arrays of `simulator.motion.step`; friction impulses are zero."""
     return Space(np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3))
 
 
 @compiled
 def sample(x, new, side, drive, first, h, tables, space):
-    """Carry `x` over one sample.
+    """Advances the state `x` over one sample.
 
     Args:
-        x: state; receives the one at the end.
-        new: memory of the same size and content.
+        x: state at the start; receives the state at the end.
+        new: work array of the same size and content.
         side: contact of the gear, as in `simulator.gear.geared_step`.
         drive: torque of the cold motor at rest in every step of the sample.
-        first: number of its first step, which tells the time.
+        first: number of the first step of the sample, from which the time is computed.
         h: length of a step [s].
         tables: `simulator.tables.Tables`.
         space: `simulator.motion.Space`.
 
     Returns:
-        The contact at the end.
+        `side` at the end.
     """
     play = tables.motor[GEAR_PLAY] > 0
     for i in range(drive.size):
@@ -137,7 +137,7 @@ def run(drive, h, tables, start, first):
         h: length of a step [s].
         tables: `simulator.tables.Tables`.
         start: whole state at the first sample.
-        first: number of the first step, which tells the time.
+        first: number of the first step, from which the time is computed.
     """
     N, substeps = drive.shape
     x, new = start.copy(), start.copy()
@@ -150,7 +150,7 @@ def run(drive, h, tables, start, first):
 
 
 def tables_of(plant: Plant, laws: Laws) -> Tables:
-    """Constants and laws as the compiled loops read them."""
+    """Constants and laws in the form that the compiled loops use."""
     emf = plant.torque_per_volt * plant.k_m * plant.K_g
     free = laws.torque.copy()
     free[JOINT, VISCOUS] += plant.B_joint
@@ -163,7 +163,7 @@ def tables_of(plant: Plant, laws: Laws) -> Tables:
 
 
 def state_of(laws: Laws, start: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)) -> Values:
-    """Whole state with these angles and speeds, everything else as `course` says."""
+    """Whole state with these angles and speeds; the other states are as at the start of `course`."""
     x = np.zeros(MEMORY + len(laws.hysteresis))
     theta, alpha, hub, joint = start
     arm = hub + joint
@@ -194,14 +194,14 @@ def course(
     start: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0),
     step: float = STEP,
 ) -> Course:
-    """Motion and inner state of the joint under a voltage that is held between samples.
+    """Motion and internal states of the joint under a voltage that is held between samples.
 
-    The motor is cold at the start, hysteretic torques are zero, oscillators move with their port,
-    and the rotor, as fast as the hub, is in the middle of its play.
+    At the start the motor is cold, hysteretic torques are zero, oscillators move with their port, and the
+    rotor has the speed of the hub and is in the middle of its play.
 
     Args:
         plant: physical constants.
-        laws: what acts besides them.
+        laws: effects in addition to these constants.
         u: voltage [V], ``(N,)``; sample `k` is held from ``k Ts`` to ``(k + 1) Ts``.
         Ts: sampling period [s].
         start: angles [rad] and speeds [rad/s] at the first sample.

@@ -1,4 +1,4 @@
-"""Recordings with a known truth: one call from the names of the hidden effects to `u` and `y`."""
+"""Recordings with a known truth: `make_record` computes `u` and `y` for the names of hidden effects."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ COUNT = 2 * np.pi / 4096
 """One count of the encoders [rad]."""
 
 JITTER = 3e-4
-"""Standard deviation of the angle noise ahead of the counter [rad]."""
+"""Standard deviation of the noise of the angles before quantisation [rad]."""
 
 TRUSTED = {"J_arm", "R_m", "k_m", "K_g", "eta"}
-"""Constants that a user knows; `k_t` stands for the unknown torque gain, so `eta` stays."""
+"""Constants that a user knows; `k_t` stands for the unknown torque gain, so `eta` keeps its value."""
 
 
 def perturbed(rng: np.random.Generator, spread: float, nominal: Plant | None = None) -> Plant:
@@ -53,7 +53,7 @@ def perturbed(rng: np.random.Generator, spread: float, nominal: Plant | None = N
 
 
 def _measured(angles: Float[np.ndarray, "N 2"], rng: np.random.Generator) -> Float[np.ndarray, "N 2"]:
-    """Angles as an encoder reports them: jitter, then whole counts."""
+    """Readings of an encoder: angles with noise, rounded to whole counts."""
     counts = np.round((angles + JITTER * rng.standard_normal(angles.shape)) / COUNT)
     return COUNT * (counts + 0.0)  # no minus zero
 
@@ -72,29 +72,28 @@ def make_record(
 ) -> dict[str, Any]:
     """A recording of a perturbed joint with hidden effects, started from rest at zero.
 
-    Input, plant and noise have random streams of their own: the same seed with other effects is
-    the same experiment on the same hardware.
+    Input, plant and noise have separate random streams: the same seed with other effects gives the same
+    experiment on the same hardware.
 
     Args:
-        effects: names and ports; as a mapping, with parameters of its own or a size of its own
-            for every effect.
+        effects: names and ports; a mapping also gives parameters, or a factor on `size`, for every effect.
         kind: input, a key of `INPUTS`.
         seed: seed of the whole record.
         size: strength of the effects relative to `DEFAULTS`.
         seconds: length [s].
         fs: sampling rate [Hz].
-        perturb: largest relative error of the nominal plant.
+        perturb: largest relative error of the unknown constants of the nominal plant.
         rms: expected root mean square of the input [V].
         nominal: plant before perturbation; the paper's joint if omitted.
         played: voltage [V] ``(N,)`` instead of one of the `INPUTS`, with its own length and size.
 
     Returns:
-        `u` [V] ``(N,)``; `y` [rad] ``(N, 2)`` as encoders report (theta, alpha); `Ts` [s]; `clean`,
-        what the sensors would have reported without noise and counting; `state`, the true
-        ``(theta, alpha, theta', alpha')``; and `truth`, a dictionary fit for JSON.
+        `u` [V] ``(N,)``; `y` [rad] ``(N, 2)``, readings of the encoders (theta, alpha); `Ts` [s]; `clean`,
+        the readings without noise and quantisation; `state`, the true ``(theta, alpha, theta', alpha')``;
+        and `truth`, a dictionary that can be written as JSON.
 
     Raises:
-        ValueError: if an effect, a parameter of it or the input is unknown.
+        ValueError: if an effect, one of its parameters or the input is unknown.
     """
     streams = np.random.SeedSequence(seed).spawn(3)
     of_input, of_plant, of_noise = (np.random.default_rng(s) for s in streams)

@@ -1,14 +1,15 @@
-r"""Whether a run shows a hidden effect: decided by the plant alone, no package asked.
+r"""Whether a hidden effect is visible in a run, computed with the simulator alone.
 
-The recorded voltage is played again to the plant without the effect, started again from the true state at the
-beginning of each window. What then differs from the true readings is reduced by all that another set of
+The plant runs again under the recorded voltage, with and without the effect, from the true state at the
+beginning of each window. From the difference :math:`d` of the readings, the part is removed that other
 constants could explain to first order,
 
 .. math::
     d_\perp = d - S (S^+ d), \qquad
     S = \partial y / \partial (J_h, K, k_t, B_h, B_j, \mathrm{offset}, \mathrm{bias}),
 
-and the effect is visible where the root mean square of :math:`d_\perp` is many deviations of the sensor.
+and the effect is visible if the root mean square of :math:`d_\perp` is many standard deviations of the sensor
+noise.
 """
 
 from __future__ import annotations
@@ -35,17 +36,18 @@ _OFFSET = 0.01
 
 
 def free_runs(plant: Plant, laws: Laws, sensors: Sensors, loop: Loop, Ts: float) -> Values:
-    """Clean readings of the plant under the recorded voltage, each window begun with the true state.
+    """Readings of the plant under the recorded voltage; each window starts at the true state.
 
     Args:
         plant: physical constants.
-        laws: what acts besides them; hysteretic torques that the true plant has more come last there.
-        sensors: what reads the angles.
+        laws: effects in addition to these constants; if the true plant has further hysteretic torques, these
+            must come last in its state.
+        sensors: sensors of the angles.
         loop: the recorded run.
         Ts: sampling period [s].
 
     Returns:
-        Readings [rad], ``(N, 2)``.
+        Readings without noise and quantisation [rad], ``(N, 2)``.
     """
     substeps = max(1, round(Ts / STEP))
     h, N = Ts / substeps, loop.u.size
@@ -63,14 +65,14 @@ def free_runs(plant: Plant, laws: Laws, sensors: Sensors, loop: Loop, Ts: float)
 def distinctness(
     plant: Plant, laws: Laws, without: Laws, sensors: Sensors, loop: Loop, Ts: float
 ) -> tuple[float, float]:
-    """Root mean square of what only the effect explains, over the sensor's deviation: theta, alpha.
+    """Root mean square of what only the effect explains, in units of the sensor noise, for theta and alpha.
 
     Args:
         plant: physical constants.
-        laws: the truth.
-        without: the same less one effect.
-        sensors: what reads the angles.
-        loop: the recorded run of the truth.
+        laws: all effects of the true plant.
+        without: the same effects except one.
+        sensors: sensors of the angles.
+        loop: the recorded run of the true plant.
         Ts: sampling period [s].
     """
     scale = sensors.deviation()

@@ -1,4 +1,4 @@
-"""What the sensors make of an angle, ahead of noise and counting."""
+"""Errors of the sensors, before noise and quantisation."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from rotflex_jax.arena.simulator.tables import BACKWARD_LOSS, BIAS, CUBIC_ERROR,
 
 
 def read(angles: Values, sensors: Values) -> Values:
-    """Readings: gain and cubic error, then weaker on the negative side, then a constant.
+    """Readings: gain and cubic error, then a smaller gain for negative values, then a bias.
 
     Args:
         angles: true angles [rad], ``(N, 2)``.

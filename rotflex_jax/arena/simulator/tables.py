@@ -1,15 +1,15 @@
-r"""What acts on the plant besides its own constants: tables of coefficients, empty by default.
+r"""Effects on the plant in addition to its constants: tables of coefficients, without effects by default.
 
-Every port carries a torque law of its own position ``z`` and speed ``s``,
+The torque at every port depends on the position ``z`` and the speed ``s`` of this port,
 
 .. math::
     f = -(B + D|s|)\, s - K\, d(z) - (K_2 + K_3 z)\, z^2 - G \sin(z + \phi) - C \sin(n z + \psi)
         - F(z, s)\,\mathrm{Sgn}(s), \quad
     F = F_\pm + E\, e^{-(s/s_0)^2} + P\,(1 + r \sin 3z),
 
-where ``Sgn(0)`` is the whole interval [-1, 1] and ``d`` takes the play out of the linear spring,
-``d(z) = z - clip(z, -p, p)``. A law with a memory is a row of `Laws.hysteresis` or `Laws.modes`.
-A new law is one more column and one more term in `simulator.torques`.
+where ``Sgn(0)`` is the whole interval [-1, 1] and ``d`` is the deflection of the linear spring without its
+play, ``d(z) = z - clip(z, -p, p)``. A law with states of its own is a row of `Laws.hysteresis` or
+`Laws.modes`. A new law needs one more column here and one more term in `simulator.torques`.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Float
 
 Values = Float[np.ndarray, "..."]
-"""Numbers whose shape the docstring tells."""
+"""Array of numbers; the docstrings give the shapes."""
 
 HUB, ARM, JOINT = 0, 1, 2
 PORTS = {"hub": HUB, "arm": ARM, "joint": JOINT}
@@ -30,18 +30,18 @@ PORTS = {"hub": HUB, "arm": ARM, "joint": JOINT}
 VISCOUS, DRAG, STIFFNESS, QUADRATIC, CUBIC, GRAVITY, PHASE = 0, 1, 2, 3, 4, 5, 6
 FRICTION_PLUS, FRICTION_MINUS, STRIBECK, STRIBECK_SPEED = 7, 8, 9, 10
 COGGING, COGGING_PHASE, PERIODS, PLAY = 11, 12, 13, 14
-# Of these the package has no exact counterpart: friction that depends on the angle, a stiffness that
-# grows in proportion to time, a torque that is a sine of time (a periodic disturbance acts on the voltage).
+# The catalogue of the package does not contain these: friction that depends on the angle, a stiffness that
+# grows linearly with time, a torque that is a sine of time (a periodic disturbance acts on the voltage).
 PATCHY, PATCHY_SHARE, DRIFT, SHAKE, SHAKE_RATE = 15, 16, 17, 18, 19
-# Nor for a push ``P exp(-((z - c) / w)^2)`` that is felt around one position only.
+# Nor this one: a torque ``P exp(-((z - c) / w)^2)`` that acts around one position only.
 PUSH, PUSH_AT, PUSH_WIDTH = 20, 21, 22
 LAWS = 23
 
-# Entries of the voltage table, in the order in which the voltage meets them.
+# Entries of the voltage table, in the order in which they act on the voltage.
 LIMIT, OFFSET, DEAD_PLUS, DEAD_MINUS, DELAY, LAG = 0, 1, 2, 3, 4, 5
 VOLTAGES = 6
 
-# Columns of the hysteresis table (`simulator.torques.build_up`) and of the oscillators on a port.
+# Columns of the hysteresis table (`simulator.torques.build_up`) and of the table of oscillators.
 AT, LEVEL, WIDTH, BETA, RISE, RISE_SPEED, DAMPING, FADING = 0, 1, 2, 3, 4, 5, 6, 7
 HYSTERESIS = 8
 MASS, RATE, LOSS = 0, 1, 2
@@ -63,13 +63,14 @@ def _no_limits() -> Values:
 
 @dataclass(frozen=True)
 class Laws:
-    """Everything that acts on the plant beyond its own constants; nothing by default.
+    """All effects on the plant in addition to its constants; none by default.
 
     Args:
         torque: coefficients of the torque laws, ``(3, LAWS)``.
         volts: coefficients of the voltage path, ``(VOLTAGES,)``.
-        hysteresis: torques that build up over an angle, one row each.
-        modes: mass, rate and damping ratio of an oscillator at the hub and one at the arm, ``(2, 3)``.
+        hysteresis: hysteretic torques, one row for each, ``(n, HYSTERESIS)``.
+        modes: inertia [kg m^2], angular frequency [rad/s] and damping ratio of an oscillator at the hub and
+            of one at the arm, ``(2, 3)``.
         motor: coefficients of motor and gear, ``(MOTOR,)``.
         sensors: errors of the two sensors, ``(2, 4)``.
     """
@@ -83,13 +84,13 @@ class Laws:
 
 
 class Tables(NamedTuple):
-    """Constants and laws as the compiled loop reads them.
+    """Constants and laws in the form that the compiled loop uses.
 
     Attributes:
-        J: inertia of the hub, of the arm, and of the motor's rotor as a part of the hub's [kg m^2].
-        emf: motor torque lost per speed [N m s/rad].
-        engaged: torque table, the plant's own constants included, hub and rotor being one.
-        free: the same without the back-EMF at the hub, which acts on the rotor alone.
+        J: inertia of the hub (rotor of the motor included), of the arm, and of the rotor [kg m^2].
+        emf: damping by the back-EMF: decrease of the motor torque per speed [N m s/rad].
+        engaged: torque table, the plant's constants included, for hub and rotor in contact.
+        free: torque table for hub and rotor apart: the back-EMF acts on the rotor, not on the hub.
         dry: whether any port has dry friction.
         hysteresis: as in `Laws`.
         modes: as in `Laws`.

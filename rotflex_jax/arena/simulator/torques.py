@@ -1,4 +1,4 @@
-"""Torques of the ports: laws of the moment, laws with a memory, oscillators on a port."""
+"""Torques at the ports: static laws, hysteretic laws and oscillators."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from rotflex_jax.arena.simulator.tables import (
 
 @compiled
 def of_the_moment(c, z, s, t):
-    """Smooth part of one port's law at position `z`, speed `s` and time `t`."""
+    """Torque at a port without dry friction and hysteresis, at position `z`, speed `s` and time `t`."""
     f = -(c[VISCOUS] + c[DRAG] * abs(s)) * s
     f -= (c[STIFFNESS] + (c[QUADRATIC] + c[CUBIC] * z) * z) * z
     if c[PLAY] != 0.0:
@@ -58,15 +58,15 @@ def of_the_moment(c, z, s, t):
 
 @compiled
 def build_up(row, x, s, h):
-    r"""State of a hysteretic torque after a step at speed `s`, and the torque meanwhile.
+    r"""State of a hysteretic torque after a step at speed `s`, and the torque in the middle of the step.
 
     .. math::
         \dot x = \frac{s}{w}\Bigl(1 - |x|\,\frac{\beta\,\mathrm{sgn}(s x) + 1 - \beta}{g(s)}\Bigr)
             - \frac{x}{T}, \quad g = 1 + r e^{-(s/s_0)^2}, \quad
         f = -F x - c\, e^{-(s/s_0)^2}\, w\, \dot x
 
-    With ``beta = 1`` and ``g = 1`` this is Dahl's law, with a `g` and a `c` that of LuGre, with
-    another ``beta`` that of Bouc and Wen (exponent 1). `FADING` is ``1 / T``, none as a rule.
+    With ``beta = 1``, ``r = 0`` and ``c = 0`` this is Dahl's law, with other `r` and `c` LuGre's law, and
+    with another ``beta`` the Bouc-Wen law (exponent 1). `FADING` is ``1 / T``, usually zero.
     """
     level, width = row[LEVEL], row[WIDTH]
     g = 1.0
@@ -83,17 +83,17 @@ def build_up(row, x, s, h):
 
 @compiled
 def oscillate(mode, r, v, z, s, h):
-    """Deflection and speed of a mass on a spring after a step, and its torque on the port.
+    """Angle and speed of a mass on a spring after a step, and its torque on the port.
 
     Args:
-        mode: mass, rate of the mass with the port held, damping ratio.
+        mode: inertia of the mass, angular frequency with the port held fixed, damping ratio.
         r: angle of the mass at the start of the step.
         v: speed of the mass at the start of the step.
-        z: angle of the port halfway.
-        s: speed of the port halfway.
+        z: angle of the port at the middle of the step.
+        s: speed of the port at the middle of the step.
         h: length of the step.
     """
     k, d = mode[RATE] ** 2, 2 * mode[LOSS] * mode[RATE]
-    # Midpoint rule, solved for the speed halfway.
+    # Midpoint rule, solved for the speed at the middle of the step.
     mid = (v + 0.5 * h * (k * (z - r) + d * s)) / (1 + 0.5 * h * (d + 0.5 * h * k))
     return r + h * mid, 2 * mid - v, -mode[MASS] * 2 * (mid - v) / h

@@ -1,4 +1,4 @@
-"""The way of a voltage to the motor: limiter, offset, dead zone, then delay, then lag."""
+"""Path of the voltage to the motor: limiter, offset, dead zone, then delay, then lag."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from rotflex_jax.arena.simulator.tables import DEAD_MINUS, DEAD_PLUS, DELAY, LAG
 
 
 def amplified(u: Values, volts: Values) -> Values:
-    """Voltages behind limiter, offset and dead zone [V]."""
+    """Voltages after limiter, offset and dead zone [V]."""
     v = np.minimum(np.maximum(u, -volts[LIMIT]), volts[LIMIT]) + volts[OFFSET]
     return np.where(
         v > volts[DEAD_PLUS],
@@ -19,16 +19,16 @@ def amplified(u: Values, volts: Values) -> Values:
 
 
 def _split(steps: float) -> tuple[int, float]:
-    """Whole steps of a delay, and the rest."""
+    """Whole steps of a delay, and the remaining part of a step."""
     whole = int(np.floor(steps + 1e-9))
     rest = steps - whole
     return whole, rest if rest > 1e-9 else 0.0
 
 
 def delayed(v: Values, steps: float, before: float) -> Values:
-    """Mean over each step of a voltage that comes `steps` steps late, `before` until then."""
+    """Mean over each step of a voltage that is delayed by `steps` steps; until then it is `before`."""
     whole, rest = _split(steps)
-    # A change inside a step counts for the part of the step that it is there.
+    # A change inside a step counts for the rest of the step.
     padded = np.concatenate([np.full(whole + 1, before), v])
     return (1 - rest) * padded[1 : v.size + 1] + rest * padded[: v.size]
 
@@ -45,14 +45,14 @@ def _lagged(v, ratio, state):
 
 
 def lagged(v: Values, ratio: float, before: float) -> Values:
-    """Mean over each step of ``dx/dt = (v - x) / time``, `ratio` being step over time."""
+    """Mean over each step of ``dx/dt = (v - x) / time``; `ratio` is the length of a step over ``time``."""
     return _lagged(v, ratio, before)[0]
 
 
 def supply(u: Values, volts: Values, substeps: int, h: float) -> Values:
     """Mean voltage at the motor in every integration step.
 
-    Ahead of the record the input is zero, and delay and lag have settled on what that gives.
+    Before the record the input is zero, and delay and lag are in steady state.
 
     Args:
         u: input [V], ``(N,)``, held over each sample.
@@ -73,7 +73,7 @@ def supply(u: Values, volts: Values, substeps: int, h: float) -> Values:
 
 
 class Path:
-    """The same way, where the next voltage is known only after the last sample: rows of `supply`.
+    """The same path sample by sample, for a voltage that a controller computes; gives the rows of `supply`.
 
     Args:
         volts: coefficients of the path.

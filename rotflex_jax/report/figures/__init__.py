@@ -1,7 +1,7 @@
-"""Every figure of a report, each with a caption that says what to see.
+"""All figures of a report, with captions.
 
-To add one, write a function of a `SearchResult` (and of an `Explanation`, if it needs one) in one of these
-modules and decorate it with `@figure`; the page shows it in its section.
+To add a figure, write a function of a `SearchResult` (and of an `Explanation` if needed) in one of these
+modules and decorate it with `@figure`. The page then shows the figure in its section.
 """
 
 from rotflex_jax.discover.explanation import Explanation
@@ -38,10 +38,10 @@ __all__ = [
 
 
 def pictures(discovery: SearchResult, explanation: Explanation | None = None) -> dict[str, Picture]:
-    """Figures by name; those that have nothing to show are left out.
+    """Name -> figure, without figures that have nothing to show.
 
     Args:
-        discovery: What was found.
-        explanation: With the missing torques; these are not drawn where None.
+        discovery: Result of a search.
+        explanation: Further results, such as latent and learned torques; None for figures without them.
     """
     return FIGURES.pictures(discovery, explanation or Explanation())

@@ -32,7 +32,7 @@ MOST_SETS = 6
     description="Bars of the probability of each set of effects and of each effect.",
 )
 def probabilities(discovery: SearchResult) -> Figure | None:
-    """Probabilities of the likeliest sets and effects; none where there is but one set."""
+    """Probabilities of the likeliest sets and effects; None if there is only one set."""
     found = discovery.probabilities
     if found is None or len(found.sets) < 2:
         return None
@@ -73,7 +73,7 @@ def probabilities(discovery: SearchResult) -> Figure | None:
     description="Bars of the score of each candidate effect.",
 )
 def ranking(discovery: SearchResult) -> Figure | None:
-    """Score of each candidate at the baseline; found ones strong, unexcited ones faint."""
+    """Score of each candidate at the baseline, coloured by its outcome in the search."""
     shown = outcomes(discovery)[:MOST_BARS]
     if not shown:
         return None
@@ -136,7 +136,7 @@ def _staircase_caption(discovery: SearchResult) -> str:
     description="Held-out error of each model on a logarithmic scale, with the noise of the sensor.",
 )
 def staircase(discovery: SearchResult) -> Figure | None:
-    """Held-out error of every stage against the noise of the sensor; none without a round."""
+    """Held-out error of every stage against the noise of the sensor; None without a round."""
     if not discovery.rounds:
         return None
     by_channel, labels = channel_units(discovery), stage_labels(discovery)
@@ -200,7 +200,7 @@ def staircase(discovery: SearchResult) -> Figure | None:
 
 
 def _comparable(discovery: SearchResult) -> dict[str, list[Estimate | None]]:
-    """Free parameters that differ clearly from zero in the final model, in every stage."""
+    """Name -> estimates in every stage, for free parameters that differ clearly from zero in the last one."""
     stages = [{e.name: e for e in s.estimates} for s in discovery.stages]
     last = stages[-1]
     clear = (e.name for e in last.values() if e.free and math.isfinite(e.std) and abs(e.value) > 3 * e.std)
@@ -215,7 +215,7 @@ def _comparable(discovery: SearchResult) -> dict[str, list[Estimate | None]]:
     description="Parameters of each model relative to their final values, with intervals.",
 )
 def parameters(discovery: SearchResult) -> Figure | None:
-    """Every free parameter of every stage, relative to its final estimate, with 95 % intervals."""
+    """Free parameters that differ clearly from zero, in every stage, relative to their final estimates."""
     rows = _comparable(discovery)
     if not rows:
         return None

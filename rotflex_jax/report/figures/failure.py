@@ -1,4 +1,4 @@
-"""Figures of where the error occurs: maps over speed and deflection, and one profile per place."""
+"""Figures that localise the error: maps over speed and deflection, and a profile for each localisation."""
 
 import dataclasses
 
@@ -25,7 +25,7 @@ from rotflex_jax.text.numbers import readable
 from rotflex_jax.text.plotting import blank, legend_above
 from rotflex_jax.text.zoom import MapView, PlaneMap
 
-# Cells of a map along each axis, and samples without which one stays blank.
+# Number of cells of a map along each axis, and least number of samples of a cell that is drawn.
 MAP_CELLS, MIN_CELL_SAMPLES = 13, 8
 MOST_PROFILES = 6
 
@@ -38,19 +38,19 @@ _AXES = {
 
 
 def _moving(discovery: SearchResult) -> tuple[str, ...]:
-    """Channels that measure a motion; all where none does."""
+    """Channels that measure a motion; all channels if none does."""
     by_channel = channel_units(discovery)
     return motion_channels(by_channel, discovery.baseline.model.mechanism) or tuple(by_channel)
 
 
 def worst_channel(discovery: SearchResult) -> str:
-    """The channel of a motion whose baseline error is the largest multiple of its noise."""
+    """Channel of a motion with the largest ratio of baseline error to sensor noise."""
     errors, floor = discovery.baseline.held_out_rmse_windows, discovery.noise_floor
     return max(_moving(discovery), key=lambda c: errors[c] / (floor.get(c) or errors[c] or 1.0))
 
 
 def _grid(discovery: SearchResult, s: Shown) -> tuple[list[np.ndarray], list[str]]:
-    """What the maps are drawn over: speed and deflection, speed and time if one channel alone moves."""
+    """Coordinates of the maps: speed and deflection, or speed and time if only one channel is a motion."""
     by_channel, channels = channel_units(discovery), _moving(discovery)
     columns = [list(by_channel).index(c) for c in channels]
     unit = by_channel[channels[0]]
@@ -84,9 +84,9 @@ def _cells(over: list[np.ndarray]) -> list[np.ndarray]:
     description="Share of the error by bins, against the share that an even spread would have.",
 )
 def profiles(discovery: SearchResult) -> Figure | None:
-    """Share of the error in each bin against the share of the time, one panel per place.
+    """Share of the error in each bin against the share of an even spread, one panel per localisation.
 
-    Frequencies are left to the spectra.
+    Localisations in frequency are not drawn; `spectra` shows the spectra of the error.
     """
     places = [w for w in discovery.where if w.kind in _AXES and len(w.edges) > 1][:MOST_PROFILES]
     if not places:
@@ -134,18 +134,18 @@ def _map_caption(discovery: SearchResult) -> str:
 
 @dataclasses.dataclass(frozen=True)
 class _Maps:
-    """What the maps of the residuals are drawn from.
+    """Data of the maps of the residuals.
 
     Attributes:
-        over: Coordinates of each sample.
-        labels: Of both coordinates.
-        edges: Of the cells along both.
-        error: Of the baseline.
-        lacking: Title -> acceleration that a model lacks; not a number where it is unknown.
-        channel: Whose error it is.
-        units: Of the error and of the acceleration, in brackets.
-        floor: Errors up to this are noise.
-        usual: Accelerations up to this are noise.
+        over: Both coordinates of each sample.
+        labels: Labels of both coordinates.
+        edges: Edges of the cells along both coordinates.
+        error: Error of the baseline.
+        lacking: Title -> acceleration that a model lacks; NaN where it is unknown.
+        channel: Channel of the error.
+        units: Units of the error and of the acceleration, in brackets.
+        floor: Standard deviation of the error that is caused by sensor noise.
+        usual: Standard deviation of the acceleration that is caused by sensor noise.
     """
 
     over: list[np.ndarray]
@@ -159,7 +159,7 @@ class _Maps:
     usual: float
 
     def mean(self, values: np.ndarray) -> np.ma.MaskedArray:
-        """Means over cells; cells that hardly any sample lies in are masked."""
+        """Means over cells; cells with fewer than `MIN_CELL_SAMPLES` samples are masked."""
         seen = np.isfinite(values)
         at = self.over[0][seen], self.over[1][seen]
         count = np.histogram2d(*at, self.edges)[0]
@@ -168,7 +168,7 @@ class _Maps:
 
     @property
     def limits(self) -> tuple[float, float]:
-        """Error and acceleration of the strongest colours: what is noise is to look pale."""
+        """Error and acceleration with the strongest colours; at least 4 times the noise, which looks pale."""
         errors = _largest([np.ma.sqrt(self.mean(self.error**2))])
         lacking = _largest([self.mean(v) for v in self.lacking.values()])
         return max(errors, 4 * self.floor) or 1.0, max(lacking, 4 * self.usual) or 1.0
@@ -210,7 +210,7 @@ ERROR_TITLE = "baseline: rms error"
 
 
 def _map_view(discovery: SearchResult) -> MapView:
-    """The maps to pan and zoom."""
+    """The maps with pan and zoom."""
     m = _maps(discovery)
     largest, strongest = m.limits
 
@@ -240,7 +240,7 @@ def _map_view(discovery: SearchResult) -> MapView:
     zoom=_map_view,
 )
 def residual_map(discovery: SearchResult) -> Figure:
-    """Error and missing acceleration over speed and deflection, before and after."""
+    """Error of the baseline, and missing acceleration before and after, over speed and deflection."""
     m = _maps(discovery)
     largest, strongest = m.limits
     maps = [(ERROR_TITLE, np.ma.sqrt(m.mean(m.error**2)))]

@@ -1,4 +1,4 @@
-"""The figures of the report; `@figure` enters one, with its caption and its section of the page."""
+"""Registry of the report's figures; `@figure` adds one, with its caption and its section of the page."""
 
 from rotflex_jax.text.plotting import FigureRegistry
 

@@ -1,4 +1,4 @@
-"""Figures of tests against data: correlations of the residuals, and the frequency response."""
+"""Figures of tests of models: correlations of the residuals, and the frequency response."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -18,7 +18,7 @@ LEAST_COHERENCE = 0.5
 
 
 def model_colours(names: Mapping[str, object]) -> dict[str, str]:
-    """Name of a model -> its colour: the baseline's, and that of the final one."""
+    """Name of a model -> its colour: one for the baseline, another for all other models."""
     return {name: BASELINE if name == "baseline" else FINAL for name in names}
 
 
@@ -63,8 +63,8 @@ def response_figure(
     """Magnitude, phase and coherence of each channel, measured and simulated.
 
     Args:
-        measured: Of the data.
-        simulated: Name of the model -> of its run.
+        measured: Frequency response of the data.
+        simulated: Name of the model -> frequency response of its run.
         channels: Channel -> unit.
         input_unit: Unit of the input.
     """
@@ -78,7 +78,7 @@ def response_figure(
         clear = measured.coherence[c] >= LEAST_COHERENCE
         turned = _unwrapped(measured.phase_deg[c], clear)
         for name, r, colour, width in listed:
-            # Within half a turn of what was measured.
+            # Phases are drawn within half a turn of the measured phase.
             degrees = turned + (r.phase_deg[c] - turned + 180.0) % 360.0 - 180.0
             style: dict[str, Any] = {"color": colour, "ls": BASELINE_LINE if name == "baseline" else "-"}
             magnitude.plot(f, r.magnitude_db[c], lw=0.7, alpha=0.35, **style)
@@ -99,7 +99,7 @@ def response_figure(
 
 
 def _unwrapped(phase: np.ndarray, clear: np.ndarray) -> np.ndarray:
-    """A phase [deg] without jumps of a turn where it is clear; elsewhere as at the last clear place."""
+    """A phase [deg] unwrapped at the clear frequencies; elsewhere the value at the last clear one below."""
     at = np.flatnonzero(clear)
     if not len(at):
         return phase
@@ -133,7 +133,7 @@ def residuals(discovery: SearchResult, explanation: Explanation) -> Figure | Non
     description="Bode diagram with coherence: magnitude and phase of the outputs over the input.",
 )
 def responses(discovery: SearchResult, explanation: Explanation) -> Figure | None:
-    """Frequency response of the data against that of the models, with coherence."""
+    """Frequency responses of the data and of the models, with coherence."""
     tests = explanation.tests
     if tests is None:
         return None

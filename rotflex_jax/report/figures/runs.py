@@ -1,4 +1,4 @@
-"""Figures of held-out runs, spectra of what is left, and the torques that are missing."""
+"""Figures of held-out runs, of spectra of the remaining error, and of missing torques."""
 
 import dataclasses
 from typing import Any
@@ -32,19 +32,19 @@ from rotflex_jax.text.numbers import readable
 from rotflex_jax.text.plotting import blank, legend_above, thinned
 from rotflex_jax.text.zoom import Line, LinePanel, LineView, Stretch
 
-# Longer recordings are shown in part [s]; the errors are those of the whole.
+# Longest part of a recording that the still picture shows [s].
 OVERLAY_SECONDS = 30.0
 
 
 @dataclasses.dataclass(frozen=True)
 class Shown:
-    """The held-out recording that is drawn, and what two stages make of it.
+    """The held-out recording that is drawn, with free runs of baseline and final model.
 
     Attributes:
         recording: The longest held-out recording.
-        measured: Its channels in the model's order .
-        baseline: Windowed free run .
-        final: The same by the final model, None where nothing was added.
+        measured: Measured channels in the model's order.
+        baseline: Free run of the baseline in windows.
+        final: Free run of the final model in windows; None if no effect was added.
         starts: First sample of each window.
     """
 
@@ -56,7 +56,7 @@ class Shown:
 
 
 def shown(discovery: SearchResult) -> Shown:
-    """What the figures of runs are drawn from."""
+    """Data of the figures of runs."""
     i = discovery.longest_validation
     recording, base = discovery.validation[i], discovery.baseline
 
@@ -73,7 +73,7 @@ def shown(discovery: SearchResult) -> Shown:
 
 
 def worst_window(discovery: SearchResult) -> tuple[int, int]:
-    """First sample and end of the window where the baseline is worst, in multiples of the noise."""
+    """First sample and end of the window with the largest baseline error relative to the noise."""
     s = shown(discovery)
     floor = np.array([discovery.noise_floor.get(c) or 1.0 for c in channel_units(discovery)])
     loss = np.sum(((s.measured - s.baseline) / floor) ** 2, axis=1)
@@ -93,7 +93,7 @@ def _overlay_caption(discovery: SearchResult) -> str:
 
 
 def _overlay_view(discovery: SearchResult) -> LineView:
-    """The whole held-out recording to pan and zoom."""
+    """The whole held-out recording with pan and zoom."""
     s = shown(discovery)
     runs: list[tuple[np.ndarray, str, str, tuple[float, ...]]] = [
         (s.baseline, BASELINE, "baseline", BASELINE_DASH)
@@ -133,7 +133,7 @@ def overlay(discovery: SearchResult) -> Figure:
     s, by_channel = shown(discovery), channel_units(discovery)
     first, last = worst_window(discovery)
     t = s.recording.t
-    # Of a long recording, the part round the worst window.
+    # Of a long recording, only the part around the worst window is drawn.
     most = round(OVERLAY_SECONDS / s.recording.Ts)
     begin = max(0, min(first - most // 2, len(t) - most))
     whole, zoom = slice(begin, min(len(t), begin + most)), slice(first, last)
@@ -203,7 +203,7 @@ def spectra(discovery: SearchResult) -> Figure:
         f = np.zeros(0)
         for run, colour, label in runs:
             error = scale * (s.measured[:, c] - run[:, c])
-            # Nine stretches of the recording or more, half overlapping, are averaged.
+            # Welch's method averages nine or more segments that overlap by half.
             length = min(4096, max(16, N // 5))
             f, density = scipy.signal.welch(error, 1 / Ts, nperseg=length, detrend="constant")
             size = np.sqrt(np.maximum(density, np.finfo(float).tiny))
@@ -244,7 +244,7 @@ def _over_motion(discovery: SearchResult, explanation: Explanation) -> str:
     description="Mean of the unknown torque at each port over its speed and position, with bands.",
 )
 def latent_over_motion(discovery: SearchResult, explanation: Explanation) -> Figure | None:
-    """The missing torque at each port over speed and position; None where it was not computed."""
+    """The missing torque at each port over speed and position; None if it was not computed."""
     latent = explanation.latent
     return latent_maps(latent.before, latent.after) if latent else None
 
@@ -257,7 +257,7 @@ def latent_over_motion(discovery: SearchResult, explanation: Explanation) -> Fig
     description="The unknown torque at each port over time with its band, and its spectrum.",
 )
 def latent_over_time(discovery: SearchResult, explanation: Explanation) -> Figure | None:
-    """The missing torque at each port in time and by frequency; None where it was not computed."""
+    """The missing torque at each port over time and frequency; None if it was not computed."""
     latent = explanation.latent
     return latent_time(latent.before, latent.after) if latent else None
 
@@ -271,6 +271,6 @@ def latent_over_time(discovery: SearchResult, explanation: Explanation) -> Figur
     description="Map of the learned torque over position and speed, with cuts and the formula.",
 )
 def learned_torque(discovery: SearchResult, explanation: Explanation) -> Figure | None:
-    """The learned torque; None where there is none or it was not kept."""
+    """The learned torque; None if there is none, or if it was not kept."""
     learned = explanation.learned
     return learned_figure(learned) if learned and learned.kept else None
