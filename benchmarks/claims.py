@@ -1,4 +1,4 @@
-"""What documents say of the benchmarks where it takes a count, a median or several numbers of the results."""
+"""Texts for documents that take a count, a median or several numbers from the results of benchmarks."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ ASKED: set[str] = set()
 
 
 def results(file: str) -> Any:
-    """A file of results."""
+    """Content of a file of results; its name is added to `ASKED`."""
     ASKED.add(file)
     return _read(file)
 
@@ -57,7 +57,7 @@ def _read(file: str) -> Any:
 
 
 def _worlds(marked: str, seen: bool = False, kind: str | None = None) -> tuple[int, int]:
-    """How many wrong worlds have a mark, of how many; without a hidden effect some marks are None."""
+    """Number of wrong worlds with a mark, and number of all; worlds whose mark is None do not count."""
     every = results("B0_wrong_worlds.json")["records"].values()
     rows = [r for r in every if (r["world"] in SEEN_WORLDS) is seen and r.get(marked) is not None]
     rows = [r for r in rows if kind in (None, r["kind"])]
@@ -66,50 +66,50 @@ def _worlds(marked: str, seen: bool = False, kind: str | None = None) -> tuple[i
 
 @named
 def worlds_named() -> str:
-    """Worlds whose hidden effect was named."""
+    """Number of worlds whose hidden effect was named, of all."""
     return "{} of {}".format(*_worlds("named"))
 
 
 @named
 def worlds_named_joint() -> str:
-    """Of these, flexible joints."""
+    """Number of flexible joints whose hidden effect was named, of all."""
     return "{} of {}".format(*_worlds("named", kind="joint"))
 
 
 @named
 def worlds_named_link() -> str:
-    """Of these, links with a strain gauge."""
+    """Number of links with a strain gauge whose hidden effect was named, of all."""
     return "{} of {}".format(*_worlds("named", kind="link"))
 
 
 @named
 def worlds_missed_bound() -> str:
-    """The share of worlds with an effect that is not named which is not excluded [%]."""
+    """Upper 95 % limit of the share of worlds whose hidden effect is not named [%]."""
     found, count = _worlds("named")
     return _at_most(count - found, count)
 
 
 @named
 def worlds_wrong_bound() -> str:
-    """The share of worlds with a wrong effect called established which is not excluded [%]."""
+    """Upper 95 % limit of the share of worlds in which a wrong effect is called established [%]."""
     return _at_most(*_worlds("wrong_established"))
 
 
 @named
 def worlds_seen_named() -> str:
-    """The same of worlds that were read before an earlier revision."""
+    """Number of worlds read before an earlier revision whose hidden effect was named, of all."""
     return "{} of {}".format(*_worlds("named", seen=True))
 
 
 @named
 def worlds_seen_wrong() -> str:
-    """Of these, worlds in which a wrong effect was called established."""
+    """Number of worlds read before an earlier revision in which a wrong effect was called established."""
     return "{} of {}".format(*_worlds("wrong_established", seen=True))
 
 
 @named
 def worlds_other_law() -> str:
-    """Of the others of these, those in which another law of the same friction was named."""
+    """Missed effects of worlds read earlier for which another law of the same friction was named, of all."""
     found = results("B0_wrong_worlds.json")["records"].values()
     missed = [r for r in found if r["world"] in SEEN_WORLDS and r.get("named") is False]
     friction = [r for r in missed if law_of(r["hidden"][0]) == "dry friction"]
@@ -123,7 +123,7 @@ def worlds_other_law() -> str:
 
 @named
 def worlds_wrong() -> str:
-    """Worlds in which a wrong effect was called established."""
+    """Number of worlds in which a wrong effect was called established, of all."""
     return "{} of {}".format(*_worlds("wrong_established"))
 
 
@@ -133,19 +133,19 @@ def _worlds_with_probabilities() -> list[dict[str, Any]]:
 
 @named
 def worlds_most_probable() -> str:
-    """Worlds whose most probable set is right."""
+    """Number of worlds whose most probable set is right, of all."""
     top = [classes(row)[0] for row in _worlds_with_probabilities()]
     return f"{sum(e.true for e in top)} of {len(top)}"
 
 
 @named
 def worlds_claimed() -> str:
-    """Mean probability of these sets [%]."""
+    """Mean probability of the most probable sets [%]."""
     return f"{100 * statistics.mean(classes(row)[0].probability for row in _worlds_with_probabilities()):.0f}"
 
 
 def _calibrated(machines: list[list[Event]], digits: int) -> str:
-    """Mean distance between probability and frequency, and what right probabilities would show."""
+    """Mean distance of probability and frequency, and the distance that right probabilities would show."""
     chance, most = scatter_of_right([[e.probability for e in answers] for answers in machines])
     error = calibration_error([e for answers in machines for e in answers])
     show = lambda x: f"{x:.{digits}f}"  # noqa: E731
@@ -154,19 +154,19 @@ def _calibrated(machines: list[list[Event]], digits: int) -> str:
 
 @named
 def worlds_calibrated() -> str:
-    """Calibration error of the most probable sets, and what right probabilities would show."""
+    """Calibration error of the most probable sets, and the error that right probabilities would show."""
     return _calibrated([classes(row)[:1] for row in _worlds_with_probabilities()], 2)
 
 
 @named
 def worlds_calibrated_all() -> str:
-    """The same of all sets."""
+    """Calibration error of all sets, and the error that right probabilities would show."""
     return _calibrated([classes(row) for row in _worlds_with_probabilities()], 3)
 
 
 @named
 def worlds_credible() -> str:
-    """In how many a credible set of 90 % holds the truth [%], and its mean size."""
+    """Share of worlds whose credible set of 90 % contains the truth [%], and the mean size of the set."""
     c = credible(_worlds_with_probabilities())
     return f"{100 * c.held:.0f} % (mean size {c.size:.1f})"
 
@@ -190,7 +190,7 @@ IN_WORDS = {
 
 
 def joint_errors(way: str, stage: int) -> str:
-    """Errors of short runs, and in brackets of one run, of a stage of a search [deg]."""
+    """Errors of short free runs at a stage of a search, and in brackets errors of one whole run [deg]."""
     found = results("B1.json")["search"][WAYS[way]]
     here = [found["baseline"], *found["rounds"]][stage]
     short, whole = (
@@ -208,13 +208,13 @@ def joint_effects(way: str) -> list[str]:
 
 
 def joint_first(way: str) -> str:
-    """The first effect and the errors with it."""
+    """The first effect that a search found, and the errors with it."""
     found = joint_effects(way)
     return f"{found[0]}: {joint_errors(way, 1)}" if found else "none was found"
 
 
 def joint_all(way: str) -> str:
-    """The further effects and the errors with all."""
+    """The further effects that a search found, and the errors with all effects."""
     found = joint_effects(way)
     return f"{', '.join(found[1:])}: {joint_errors(way, -1)}" if len(found) > 1 else "the same"
 
@@ -234,14 +234,14 @@ def joint_noise() -> str:
 
 @named
 def joint_fitted_freely() -> str:
-    """Short free runs over run B of LuGre friction and hysteresis, fitted to free runs over run A [deg]."""
+    """Errors of short free runs over B of LuGre friction and hysteresis, fitted to free runs over A [deg]."""
     found = results("B1.json")["fits"]["LuGre at the hub, Bouc-Wen at the joint, from A"]
     return " / ".join(f"{e:.2f}" for e in found["judged"]["B"]["no_offset"])
 
 
 @named
 def joint_theta_fall() -> str:
-    """By how much Coulomb friction lets the short-run error of theta fall, from run A to run B."""
+    """Factor by which Coulomb friction fitted to run A reduces the short-run error of theta over run B."""
     found = results("B1.json")
     before = math.degrees(found["search"]["A to B"]["baseline"]["held_out_rmse_windows"]["theta"])
     after = found["fits"]["Coulomb at the hub, from A"]["judged"]["B"]["no_offset"][0]
@@ -252,14 +252,14 @@ def joint_theta_fall() -> str:
 
 
 def _measured() -> dict[str, dict[str, Any]]:
-    """Directions of machines by their input alone; the same runs with signals are told apart."""
+    """Directions (training to test data) of machines without signals; those with signals are left out."""
     rows = results("B9.json")["rows"]
     return {key: row for key, row in rows.items() if not MACHINES[row["machine"]].with_signals}
 
 
 @named
 def measured_others() -> str:
-    """Other methods that had the same recordings."""
+    """Number of other methods that had the same recordings."""
     (count,) = {len(row["others"]["rows"]) for row in _measured().values()}
     return str(count)
 
@@ -270,7 +270,7 @@ def _used(row: dict[str, Any]) -> dict[str, Any]:
 
 
 def measured_lead(row: dict[str, Any], horizon: str, channel: int) -> float | None:
-    """Error of the best other method over that of the model to use.
+    """Error of the best other method over the error of the model to use.
 
     Args:
         row: A direction.
@@ -291,7 +291,7 @@ def measured_lead(row: dict[str, Any], horizon: str, channel: int) -> float | No
 
 
 def measured_ahead(horizon: str, channel: int) -> str:
-    """Directions in which the model to use is ahead of every other method, and all."""
+    """Number of directions in which the model to use is better than every other method, of all."""
     leads = [measured_lead(row, horizon, channel) for row in _measured().values()]
     have = [lead for lead in leads if lead is not None]
     return f"{sum(lead > 1 for lead in have)} of {len(have)}"
@@ -327,8 +327,9 @@ _OF_STAGES = {
     "feedback to lqr": "2011 to 2026",
     "lqr and half of feedback to the rest": "2026 and half of 2011 to the rest",
     "feedback and half of lqr to the rest": "2011 and half of 2026 to the rest",
+    "first 70 % of all to the rest": "first 70 % of both to the rest",
 }
-for _stage, _ways in ((1, list(_OF_STAGES)), (2, list(_OF_STAGES)[:2])):
+for _stage, _ways in ((1, list(_OF_STAGES)[:6]), (2, list(_OF_STAGES))):
     for _way in _ways:
         MEASURED_DIRECTIONS[f"two_dof_link_{_stage}: {_way}"] = (
             f"two-link machine, stage {_stage}, {_OF_STAGES[_way]}"
@@ -367,7 +368,7 @@ def measured_models() -> str:
 
 
 def _in_degrees(errors: dict[str, float], stage: int | None = None) -> str:
-    """Errors of theta and alpha over 2 s; of a stage of both where one is named."""
+    """Errors of theta and alpha over 2 s [deg]; with `stage` errors of this stage of a two-stage machine."""
     names = [name if stage is None else f"{name}{stage}" for name in ("theta", "alpha")]
     return " / ".join(f"{math.degrees(errors[name]):.2f}" for name in names)
 
@@ -377,7 +378,7 @@ LINEAR = ("arx", "subspace", "state_space")
 
 
 def _best_linear(row: dict[str, Any]) -> str:
-    """Errors of the best of these methods on the test, which ranks them, and its name."""
+    """Errors and name of the linear method that is best on the test data, by which the rows are ranked."""
     best = next(m for m in row["others"]["rows"] if m["method"] in LINEAR and m["status"] == "ok")
     return f"{_in_degrees(best['held_out_rmse_windows'])} ({best['method']})"
 
@@ -423,12 +424,16 @@ FITTED_MACHINES = {
 }
 
 
-# Fits whose costs differ by no more have the same one [nat].
+# Costs of fits that differ by no more than this count as equal [nat].
 SAME_COST = 1.0
 
 
 def _above_coulomb(which: int) -> str:
-    """Fits of laws that contain Coulomb's which end above its fit with restarts; 0 without them, 1 with."""
+    """Number of fits that end with a larger cost than Coulomb friction, though their law contains it.
+
+    Args:
+        which: 0 for fits without restarts, 1 with restarts; the fit of Coulomb friction has restarts.
+    """
     each = [
         pair[which]["cost"] > laws["coulomb"][1]["cost"] + SAME_COST
         for laws in results("B15.json")["rows"].values()
@@ -439,7 +444,7 @@ def _above_coulomb(which: int) -> str:
 
 
 def _ratio(pairs: list[list[dict[str, Any]]], errors: str) -> float:
-    """Errors of fits with restarts over those without: geometric mean over fits and channels."""
+    """Errors of fits with restarts over errors without: geometric mean over fits and channels."""
     logs = [math.log(more[errors][c] / one[errors][c]) for one, more in pairs for c in one[errors]]
     return math.exp(statistics.mean(logs))
 
@@ -461,14 +466,14 @@ def restarted_fits() -> str:
 
 @named
 def restarts_take() -> str:
-    """Time of a fit with restarts over that without: median and largest."""
+    """Time of a fit with restarts over the time without: median and largest."""
     rows = results("B15.json")["rows"]
     ratios = [more["seconds"] / one["seconds"] for laws in rows.values() for one, more in laws.values()]
     return f"{statistics.median(ratios):.0f} times as long in the median and {max(ratios):.0f} times at most"
 
 
 def _whole_converged(which: int) -> str:
-    """How many fits to whole runs converge, of how many; 0 without restarts, 1 with."""
+    """Number of fits to whole runs that converge, of all; `which` is 0 without restarts, 1 with restarts."""
     each = [pair[which]["status"] == "converged" for pair in results("B15.json")["whole"].values()]
     return f"{sum(each)} of {len(each)}"
 
@@ -487,9 +492,11 @@ SEEN = (1000, 1001)
 def records(
     *, outside: bool = False, hidden: bool = True, effects: int = 1, size: float = 1.0
 ) -> list[dict[str, Any]]:
-    """Records that no revision saw: of effects that the search knows, of others, or of nothing it could find.
+    """Records whose seeds were not looked at in a revision of the search.
 
-    Of known effects so many at once, of that share of the usual size, seen by both sensors.
+    By default these are records with known effects: `effects` of them at once, of the share `size` of their
+    usual size, with both sensors. With `outside` they have an effect that the catalogue lacks; with
+    `hidden=False` they have nothing to be found.
     """
     every = results("B0.json")["records"].values()
     ran = [r for r in every if "error" not in r and r["seed"] not in SEEN]
@@ -503,74 +510,74 @@ def records(
 
 @named
 def arena_seen() -> str:
-    """Seeds that are left out."""
+    """Seeds of the records that are left out."""
     return " and ".join(map(str, SEEN))
 
 
 @named
 def arena_hidden() -> str:
-    """Records with one effect to be found."""
+    """Number of records with one effect to be found."""
     return str(len(records()))
 
 
 @named
 def arena_first() -> str:
-    """How many of them named it first."""
+    """Number of records with one effect to be found in which it was named first."""
     return str(sum(bool(r["first"]) for r in records()))
 
 
 @named
 def arena_small() -> str:
-    """Records with one effect of a fifth of its usual size."""
+    """Number of records with one effect of a fifth of its usual size."""
     return str(len(records(size=0.2)))
 
 
 @named
 def arena_small_first() -> str:
-    """How many of them named it first."""
+    """Number of records with one effect of a fifth of its usual size in which it was named first."""
     return str(sum(bool(r["first"]) for r in records(size=0.2)))
 
 
 @named
 def arena_pairs() -> str:
-    """Records with two effects to be found."""
+    """Number of records with two effects to be found."""
     return str(len(records(effects=2)))
 
 
 @named
 def arena_pairs_both() -> str:
-    """In how many of them both are found or in a set that was reported."""
+    """Number of records with two effects in which both were found or in a set that was reported."""
     return str(sum(r["hits"] == 2 for r in records(effects=2)))
 
 
 @named
 def arena_pairs_one() -> str:
-    """In how many of them at least one is."""
+    """Number of records with two effects in which at least one was found or in a set that was reported."""
     return str(sum(r["hits"] >= 1 for r in records(effects=2)))
 
 
 @named
 def arena_inside() -> str:
-    """In how many of them the effect is found or in a set that was reported."""
+    """Number of records with one effect in which it was found or in a set that was reported."""
     return str(sum(bool(r["inside"]) for r in records()))
 
 
 @named
 def arena_nothing() -> str:
-    """Records in which nothing is to be found."""
+    """Number of records in which nothing is to be found."""
     return str(len(records(hidden=False)))
 
 
 @named
 def arena_alarms() -> str:
-    """How many of them raised an alarm."""
+    """Number of records in which nothing is to be found, but an effect was named (false alarms)."""
     return str(sum(bool(r["rounds"]) for r in records(hidden=False)))
 
 
 def most(k: int, n: int) -> float:
-    """The largest share of which k of n or fewer would be seen in one case of twenty.
+    """Upper limit of the exact one-sided 95 % confidence interval of a share, for k cases of n.
 
-    The upper end of the exact one-sided 95 % interval of a share.
+    If the true share had this value, k or fewer cases of n would occur with a probability of 5 %.
 
     Source: C. J. Clopper and E. S. Pearson, Biometrika 26, 1934.
 
@@ -581,58 +588,58 @@ def most(k: int, n: int) -> float:
 
 
 def _at_most(k: int, n: int) -> str:
-    """That share in per cent, rounded up."""
+    """The upper limit from `most` in per cent, rounded up."""
     return f"{math.ceil(1000 * most(k, n)) / 10:.1f}"
 
 
 @named
 def arena_alarm_bound() -> str:
-    """The share of alarms that is not excluded [%]."""
+    """Upper 95 % limit of the share of false alarms [%]."""
     return _at_most(int(arena_alarms()), int(arena_nothing()))
 
 
 @named
 def arena_missed_bound() -> str:
-    """The share of missed effects that is not excluded [%]."""
+    """Upper 95 % limit of the share of missed effects [%]."""
     found, count = int(arena_inside()), len(records())
     return _at_most(count - found, count)
 
 
 @named
 def arena_overlooked_bound() -> str:
-    """The share of effects outside of the catalogue called otherwise that is not excluded [%]."""
+    """Upper 95 % limit of the share of effects outside of the catalogue not called unexplained [%]."""
     found, count = int(arena_unexplained()), int(arena_outside())
     return _at_most(count - found, count)
 
 
 @named
 def arena_outside() -> str:
-    """Records with an effect that the catalogue lacks."""
+    """Number of records with an effect that the catalogue lacks."""
     return str(len(records(outside=True)))
 
 
 @named
 def arena_unexplained() -> str:
-    """How many of them were called unexplained."""
+    """Number of records with an effect that the catalogue lacks which were called unexplained."""
     return str(sum(r["verdict"] == "unexplained" for r in records(outside=True)))
 
 
 @named
 def arena_outside_named() -> str:
-    """In how many of them an effect was named, which cannot be right."""
+    """Number of records with an effect that the catalogue lacks in which an effect was named, wrongly."""
     return str(sum(bool(r["rounds"]) for r in records(outside=True)))
 
 
 @named
 def arena_over_oracle() -> str:
-    """Median of held-out error over that of the true structure, over all records and channels."""
+    """Median of held-out error over error of the true structure, in records with one effect, all channels."""
     ratios = sorted(v for r in records() for v in r.get("over_oracle", {}).values())
     return f"{ratios[len(ratios) // 2]:.2f}"
 
 
 @named
 def arena_intervals() -> str:
-    """Share of 95 % intervals that hold the truth [%]."""
+    """Share of 95 % intervals that contain the true value, over records with one effect [%]."""
     numbers = [p for r in records() for p in r["parameters"].values() if p.get("std")]
     held = sum(abs(p["estimate"] - p["true"]) <= HALF_WIDTH_95 * p["std"] for p in numbers)
     return f"{100 * held / len(numbers):.0f}" if numbers else "–"
@@ -640,7 +647,7 @@ def arena_intervals() -> str:
 
 @named
 def arena_numbers() -> str:
-    """How many parameters these intervals are of."""
+    """Number of parameters with a 95 % interval, over records with one effect."""
     return str(sum(bool(p.get("std")) for r in records() for p in r["parameters"].values()))
 
 
@@ -678,7 +685,7 @@ for _part in ("multisine", "arrow"):
 
 @named
 def silverbox_errors() -> str:
-    """Errors of free runs over the official tests, found and published [mV]."""
+    """Table of errors of free runs over the official tests, of models that were found and published [mV]."""
     case = results("B3.json")["silverbox"]
     tests = list(case["rows"][0]["free run"])
     last = len(case["rounds"])
@@ -699,7 +706,7 @@ def silverbox_errors() -> str:
 
 @named
 def emps_errors() -> str:
-    """Errors of models of EMPS, each fitted to one free run over the training record [mm]."""
+    """Table of errors of models of EMPS, each fitted to one free run over the training record [mm]."""
     case = results("B3.json")["emps"]
     words = ("mass and viscous damping", "+ dry friction", "+ damping unequal in the two directions")
     labels = [*words, "+ an offset that drifts through the record"]
@@ -726,7 +733,7 @@ EMPS_PARAMETERS = {
 
 @named
 def emps_parameters() -> str:
-    """Parameters of EMPS by several fits, with 95 % intervals, and as published."""
+    """Table of parameters of EMPS by several fits, with 95 % intervals, and as published."""
     case = results("B3.json")["emps"]
     predictions = {c["parameter"]: c["prediction"] for c in case["conditional_intervals"]}
     of_search, of_run = _last_effect("emps")["search estimates"], case["rows"][-1]["free-run estimates"]
@@ -772,7 +779,7 @@ def rigid_arm_errors() -> str:
 
 @named
 def emps_narx() -> str:
-    """The published error that the text names [mm]."""
+    """Published error of the polynomial NARX model of EMPS [mm]."""
     return f"{results('B3.json')['emps']['published']['polynomial NARX']['pulses']:.2f}"
 
 
@@ -783,33 +790,33 @@ def _millimetres(pair: list[float]) -> str:
 
 @named
 def emps_unequal() -> str:
-    """By how much the damping is stronger backwards than forwards [N s/m]."""
+    """Damping of EMPS backwards less its damping forwards [N s/m]."""
     found = _last_effect("emps")["search estimates"]["axis.viscous_asymmetric.asymmetry"]
     return f"{-2 * found['value']:.0f}"
 
 
 @named
 def emps_candidates() -> str:
-    """Candidates of the first round of free runs."""
+    """Number of candidates in the first round of free runs of EMPS."""
     return str(len(results("B3.json")["emps"]["free-run rounds"][0]["tried"]))
 
 
 @named
 def emps_before_drift() -> str:
-    """Errors of free runs over the two held-out parts before an effect was added [mm]."""
+    """Errors of free runs of EMPS over the two held-out parts before an effect was added [mm]."""
     return _millimetres(results("B3.json")["emps"]["free-run rounds"][0]["held_out"])
 
 
 @named
 def emps_with_drift() -> str:
-    """The same with the effect that was taken [mm]."""
+    """Errors of free runs of EMPS over the two held-out parts with the effect that was added [mm]."""
     found = results("B3.json")["emps"]["free-run rounds"][0]
     return _millimetres(found["tried"][found["taken"]])
 
 
 @named
 def emps_runner_up() -> str:
-    """The same with the effect whose larger error is the least of the others [mm]."""
+    """Errors over these two parts with the next best effect, by the larger of its two errors [mm]."""
     found = results("B3.json")["emps"]["free-run rounds"][0]
     return _millimetres(min((e for name, e in found["tried"].items() if name != found["taken"]), key=max))
 
@@ -819,12 +826,12 @@ def emps_runner_up() -> str:
 
 @named
 def methods_count() -> str:
-    """Methods that were compared on the mixed split of the measured joint."""
+    """Number of methods that were compared on the mixed split of the measured joint."""
     return str(len(results("B5/rotflex_mixed.json")["rows"]))
 
 
 def _fit_seconds() -> dict[str, float]:
-    """What each method but the two that search took to fit, from run A of the measured joint [s]."""
+    """Fit time of each method on run A of the measured joint, without the two methods that search [s]."""
     rows = results("B5/rotflex_AB.json")["rows"]
     slow = ("discovered", "learned_torque")
     return {r["method"]: r["fit_seconds"] for r in rows if r["method"] not in slow and r["fit_seconds"]}
@@ -832,26 +839,26 @@ def _fit_seconds() -> dict[str, float]:
 
 @named
 def compare_seconds() -> str:
-    """All of them together [s]."""
+    """Sum of the fit times of all methods that do not search [s]."""
     return f"{sum(_fit_seconds().values()):.0f}"
 
 
 @named
 def compare_ensemble() -> str:
-    """The one that takes longest [s]."""
+    """Longest of these fit times, of the method `sindy_ensemble` [s]."""
     assert max(_fit_seconds(), key=_fit_seconds().__getitem__) == "sindy_ensemble"
     return f"{_fit_seconds()['sindy_ensemble']:.0f}"
 
 
 @named
 def compare_first() -> str:
-    """The first fit of the physics, which compiles for the others [s]."""
+    """Time of the first fit of a physical model, which compiles for the others [s]."""
     return f"{_fit_seconds()['linear']:.0f}"
 
 
 @named
 def compare_other() -> str:
-    """The slowest of the others [s]."""
+    """Longest fit time of the other methods that do not search [s]."""
     return f"{max(s for m, s in _fit_seconds().items() if m not in ('sindy_ensemble', 'linear')):.1f}"
 
 
@@ -860,7 +867,7 @@ def compare_other() -> str:
 
 @named
 def fleet_million() -> str:
-    """What the machinery around a million searches takes [min]."""
+    """Time that the machinery around a million searches takes [min]."""
     return f"{1e6 * results('B8.json')['fleet']['searched'] / 60:.0f}"
 
 
@@ -874,7 +881,7 @@ def fleet_workers() -> str:
 
 
 def _change(name: str, kernel: str) -> str:
-    """By how much an effect changes a kernel."""
+    """Relative change of a kernel by an effect, in per cent."""
     share = 100 * results("B8.json")["kernels"]["shares"][name][kernel]
     return f"{share:.2g} %" if share else "exactly nothing"
 
@@ -898,7 +905,7 @@ def _in_noise(hidden: str, when: str) -> str:
 
 
 def _reads(hidden: str) -> str:
-    """The formula of a learned torque, for a cell of a table."""
+    """The formula of a learned torque, for a cell of a table; empty if it was not kept."""
     found = results("B8.json")["torque"][hidden]
     return "`" + found["formula"].replace("|", "\\|") + "`" if found["kept"] else ""
 
@@ -911,17 +918,18 @@ for _hidden in ("friction", "drag", "uneven friction", "nothing"):
 
 # -- other ways to find the effect --------------------------------------------------------------------------
 
-# Fits every candidate with this package's own simulator, hence no other tool's: counted apart.
+# This method fits every candidate with the simulator of this package. It is no independent tool, so it is
+# counted separately.
 REFITS = "refit + BIC"
 
 
 def _search() -> dict[str, Any]:
-    """Sums of the search on the records that the others were given."""
+    """Counts of the search on the records that the other methods were given."""
     return results("B6.json")["summary"]["rotflex_jax"]
 
 
 def _regressions() -> dict[str, dict[str, Any]]:
-    """Sums of the regressions that were given all records that the search was."""
+    """Counts of the regressions that were given all records that the search was given."""
     summary = results("B6.json")["summary"]
     given = lambda sums: (sums["first"][1], sums["false_alarms"][1])  # noqa: E731
     every = given(summary["rotflex_jax"])
@@ -931,50 +939,50 @@ def _regressions() -> dict[str, dict[str, Any]]:
 
 @named
 def rivals_records() -> str:
-    """Records with an effect that all methods were given."""
+    """Number of records with an effect that all methods were given."""
     return str(_search()["first"][1])
 
 
 @named
 def rivals_ours() -> str:
-    """In how many the search named it first."""
+    """Number of records with an effect in which the search named it first."""
     return str(_search()["first"][0])
 
 
 @named
 def rivals_exact() -> str:
-    """In how many the search named it and nothing else."""
+    """Number of records with an effect in which the search named it and nothing else."""
     return str(_search()["exact"][0])
 
 
 @named
 def rivals_refits() -> str:
-    """In how many the lowest BIC of all refits was the hidden effect's."""
+    """Number of records with an effect in which the refit of this effect had the lowest BIC of all."""
     return str(results("B6.json")["summary"][REFITS]["first"][0])
 
 
 @named
 def rivals_refits_exact() -> str:
-    """In how many the refits named it and nothing else."""
+    """Number of records with an effect in which the refits named it and nothing else."""
     return str(results("B6.json")["summary"][REFITS]["exact"][0])
 
 
 @named
 def rivals_refits_seconds() -> str:
-    """What the refits take of a processor, a record: median and most."""
+    """Processor time of the refits for one record: median and largest."""
     taken = [r["cpu_s"] for r in results("B6.json")["rows"].values() if r["rival"] == REFITS]
     return f"{statistics.median(taken):.0f} s (at most {max(taken):.0f})"
 
 
 @named
 def rivals_best() -> str:
-    """In how many the best of the regressions named it first."""
+    """Number of records with an effect in which the best of the regressions named it first."""
     return str(max(sums["first"][0] for sums in _regressions().values()))
 
 
 @named
 def rivals_count() -> str:
-    """How many regressions there are."""
+    """Number of regressions."""
     return str(len(_regressions()))
 
 
@@ -988,27 +996,27 @@ def rivals_columns() -> str:
 
 @named
 def rivals_alarms() -> str:
-    """Alarms of the regressions where nothing was hidden: the least and the most."""
+    """False alarms of the regressions in records with nothing hidden: smallest and largest number."""
     alarms = [sums["false_alarms"][0] for sums in _regressions().values()]
     return f"{min(alarms)} to {max(alarms)}"
 
 
 @named
 def rivals_refits_alarms() -> str:
-    """Alarms of the refits where nothing was hidden."""
+    """Number of false alarms of the refits in records with nothing hidden."""
     return str(results("B6.json")["summary"][REFITS]["false_alarms"][0])
 
 
 @named
 def rivals_outside() -> str:
-    """Records with an effect that the catalogue lacks, and in how many the refits named something."""
+    """Number of records with an effect that the catalogue lacks in which the refits named one, of all."""
     rows = [r for r in results("B6.json")["rows"].values() if r["rival"] == REFITS and r["outside"]]
     return f"{sum(bool(r['rounds']) for r in rows)} of {len(rows)}"
 
 
 @named
 def rivals_nothing() -> str:
-    """Records with nothing hidden that all were given."""
+    """Number of records with nothing hidden that all methods were given."""
     return str(_search()["false_alarms"][1])
 
 
@@ -1026,9 +1034,9 @@ def certainty_cost() -> str:
 
 
 def _until_decided(kind: str) -> list[tuple[float, float]]:
-    """Seconds that a kind of standard input and that the loop needed in each case that can be decided.
+    """Times to a decision with a kind of standard input and with the loop, in each decidable case [s].
 
-    What decides nothing or wrongly counts as if it had needed the whole time.
+    An experiment that decides nothing, or decides wrongly, counts with the longest time.
     """
     found = results("B4_sequential.json")
     rows, most = [r for r in found["rows"] if not r["hopeless"]], 20.0
@@ -1038,30 +1046,33 @@ def _until_decided(kind: str) -> list[tuple[float, float]]:
 
 
 def _kind_seconds(kind: str) -> str:
-    """Median over the cases [s]."""
+    """Median over the cases of the time to a decision with a kind of standard input [s]."""
     return f"{statistics.median(a for a, _ in _until_decided(kind)):.1f}"
 
 
 def _kind_ratio(kind: str) -> str:
-    """Median of its seconds over those of the loop."""
+    """Median over the cases of the time with a kind of standard input over the time of the loop."""
     return f"{statistics.median(a / b for a, b in _until_decided(kind)):.1f}"
 
 
 def _best_kind() -> str:
-    """The kind whose median over the cases is least."""
+    """The kind of standard input with the smallest median time over the cases."""
     names = {"prbs": "binary sequence"}
     kind = results("B4_sequential.json")["summary"]["kind"]
     return names.get(kind, kind)
 
 
 def _medians() -> str:
-    """Median seconds of the best kind over the median seconds of the loop."""
+    """Median time of the best kind of standard input over the median time of the loop."""
     summary = results("B4_sequential.json")["summary"]
     return f"{summary['kind_seconds'] / summary['seconds']:.1f}"
 
 
 def _slow_ratio() -> str:
-    """Median ratio where the standard input that was fastest in hindsight took more than one second."""
+    """Median ratio of times of the fastest standard input and the loop, where the input takes over 1 s.
+
+    Which standard input is the fastest in a case is known only in hindsight.
+    """
     ratios = []
     for row in results("B4_sequential.json")["rows"]:
         if not row["hopeless"]:
@@ -1081,7 +1092,7 @@ for _kind in ("multisine", "prbs", "sweep", "steps", "noise"):
 
 
 def _next_ratio(pair: str) -> str:
-    """How many times a design is worth the best standard input: the least and the largest."""
+    """Worth of a design over the worth of the best standard input: smallest and largest ratio."""
     ratios = []
     for row in results("B4.json")["rows"]:
         if row["pair"] == pair:
@@ -1106,7 +1117,7 @@ WITH_SLOPES = 3.5
 
 @named
 def servo_rollouts() -> str:
-    """Free runs of the evolution of the grey box over those of its fit."""
+    """Number of free runs of the evolution (CMA-ES) of the grey box over the number for its fit."""
     name = "weight friction, delay"
     took = [results("B10.json")["summary"][n]["rollouts"] for n in (f"{name}, CMA-ES", name)]
     return f"{took[0] / took[1]:.0f}"
@@ -1114,7 +1125,7 @@ def servo_rollouts() -> str:
 
 @named
 def servo_robust_ratio() -> str:
-    """Free runs of the evolution of M4 over those of the robust fit, counted as so many."""
+    """Free runs of the evolution of M4 over those of the robust fit, each of which counts `WITH_SLOPES`."""
     summary = results("B10.json")["summary"]
     took = [summary[n]["rollouts"] for n in ("M4", "motor friction, delay, robust")]
     return f"{took[0] / (WITH_SLOPES * took[1]):.0f}"
@@ -1122,13 +1133,13 @@ def servo_robust_ratio() -> str:
 
 @named
 def servo_robust_processor() -> str:
-    """Processor time of the robust fit [s], the median over what was left out."""
+    """Processor time of the robust fit [s], median over the splits."""
     rows = (case["motor friction, delay, robust"] for case in results("B10.json")["splits"].values())
     return f"{statistics.median(row['processor seconds'] for row in rows):.0f}"
 
 
 def _arm_runs(name: str) -> str:
-    """Free runs of a recording that a model of the SO-101 took, the median of its joints."""
+    """Number of free runs of a recording for the fit of a model of the SO-101, median over its joints."""
     took = (row["takes"][name]["rollouts"] for row in results("B10.json")["so101"])
     return f"{statistics.median(took):,.0f}"
 
@@ -1143,7 +1154,7 @@ def _arm_others(name: str) -> str:
 
 
 def _arm_all(name: str) -> str:
-    """The same over `step_response` too, all motions that no fit used [deg]."""
+    """Mean error of a model of the SO-101 over all motions that no fit used, also `step_response` [deg]."""
     rows = results("B10.json")["so101"]
     away = [e for row in rows for e in (row[name], *(errors[name] for errors in row["others"].values()))]
     return f"{statistics.mean(away):.2f}"
@@ -1169,7 +1180,7 @@ for _k, _model in enumerate(ARM):
 
 
 def _arm_ratio(evolved: str, fitted: str, cost: float = 1.0) -> str:
-    """Free runs of an evolution at the SO-101 over those of a fit of some cost each; medians of joints."""
+    """Free runs of an evolution at the SO-101 over those of a fit, of `cost` each; medians over joints."""
     rows = results("B10.json")["so101"]
     took = [statistics.median(r["takes"][n]["rollouts"] for r in rows) for n in (evolved, fitted)]
     return f"{took[0] / (cost * took[1]):.0f}"
@@ -1182,7 +1193,7 @@ NAMED["servo_arm_ratio_M1_equal"] = functools.partial(_arm_ratio, "M1", "paramet
 
 # -- speed --------------------------------------------------------------------------------------------------
 
-# Name -> row of B7.json and the row of the same table that it is set beside.
+# Name -> row of B7.json, and the row of the same table with which it is compared.
 BESIDE = {
     "lms_5": ("LMS M=5: rotflex_jax", "LMS M=5: C -O3"),
     "lms_10": ("LMS M=10: rotflex_jax", "LMS M=10: C -O3"),
@@ -1241,7 +1252,7 @@ def _digits(value: float) -> str:
 
 @named
 def order_4_over_2() -> str:
-    """How many times as much as at order 2 a run costs at order 4."""
+    """Cost of a run at order 4 over its cost at order 2."""
     return f"{_cost(BESIDE['order_4'][0]) / _cost(BESIDE['order_2'][0]):.1f}"
 
 
@@ -1254,7 +1265,7 @@ for _name, (_row_name, _base) in BESIDE.items():
 
 @named
 def waiting_for_searches() -> str:
-    """The table of waiting."""
+    """The table of waiting times for searches."""
     found = results("B7.json").get("waiting")
     return "\n".join(["", *waiting(found["waiting"]), ""]) if found else "\nNot measured yet.\n"
 
@@ -1268,7 +1279,7 @@ def _with_probabilities() -> list[dict[str, Any]]:
 
 @named
 def calibrated_machines() -> str:
-    """Machines of the arena with effects of the catalogue, or with none, whose sets have probabilities."""
+    """Number of machines of the arena, with effects of the catalogue or none, with probabilities of sets."""
     return str(len(_with_probabilities()))
 
 
@@ -1291,43 +1302,43 @@ def _fresh_mutants() -> list[dict[str, Any]]:
 
 @named
 def mutants_drawn() -> str:
-    """Changes of a constant or an operator that were tried in modules that decide."""
+    """Number of mutants: changes of a constant or an operator in modules that decide."""
     return str(len(_mutants()))
 
 
 @named
 def mutants_first() -> str:
-    """How many of them the tests noticed when they were drawn."""
+    """Number of mutants that the tests noticed when the mutants were drawn."""
     return str(sum(r["first"] for r in _mutants()))
 
 
 @named
 def mutants_noticed() -> str:
-    """How many of them the tests notice now."""
+    """Number of mutants that the tests notice now."""
     return str(sum(r["noticed"] for r in _mutants()))
 
 
 @named
 def mutants_same() -> str:
-    """How many of the others change nothing."""
+    """Number of mutants that change nothing."""
     return str(sum("equivalent" in r for r in _mutants()))
 
 
 @named
 def mutants_fresh() -> str:
-    """How many of a second sample were noticed when they were drawn."""
+    """Number of mutants of a second sample that the tests noticed when they were drawn, of all."""
     rows = _fresh_mutants()
     return f"{sum(r['first'] for r in rows)} of {len(rows)}"
 
 
 @named
 def mutants_fresh_same() -> str:
-    """How many of the others of that sample change nothing."""
+    """Number of mutants of the second sample that change nothing."""
     return str(sum("equivalent" in r for r in _fresh_mutants()))
 
 
 @named
 def mutants_fresh_share() -> str:
-    """Share of those that change something which was noticed when it was drawn [%]."""
+    """Share of mutants noticed when drawn, in the second sample without those that change nothing [%]."""
     rows = [r for r in _fresh_mutants() if "equivalent" not in r]
     return f"{100 * sum(r['first'] for r in rows) / len(rows):.0f}"

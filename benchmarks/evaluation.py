@@ -20,7 +20,8 @@ ESTABLISHED, PROVISIONAL = "established", "provisional"
 WINDOW = 2.0
 """Length of the short free runs, and of the beginning that an offset is found on [s]."""
 
-# Offsets tried at a time, between limits that are a share of the largest voltage; how often they close in.
+# Number of offsets on a grid; half width of the first grid as a share of the largest voltage; number of
+# grids, each finer than the one before.
 TRIED, SHARE, ROUNDS = 21, 0.1, 3
 
 Recordings = Sequence[rf.Recording]
@@ -34,7 +35,7 @@ def searched(
     test: Recordings,
     progress: Callable[[str], None] | None = None,
 ) -> rf.Discovery:
-    """A search; it is told of the test recordings where it can report errors on them."""
+    """A search; it is given the test recordings if its version of `rf.discover` can report errors on them."""
     parameters = inspect.signature(rf.discover).parameters
     knows_test = "test" in parameters and "validation" in parameters
     options: dict[str, Any] = {"test": list(test)} if knows_test else {}
@@ -44,7 +45,7 @@ def searched(
 
 
 def named(result: rf.Discovery) -> list[dict[str, Any]]:
-    """What a search found, as its JSON has it; a search without the word calls all of it established."""
+    """Effects that a search found, from its JSON; without a `status` there, they count as established."""
     return [
         {
             "effect": r["effect"],
@@ -63,8 +64,8 @@ def errors(model: rf.Model | Callable[[rf.Recording], rf.Model], recordings: Rec
     """Root mean square errors of free runs over recordings that the model has not seen.
 
     Args:
-        model: fitted, or what gives the model of a recording.
-        recordings: one or several; of each the first `n_init` samples tell the first state.
+        model: fitted model, or a function that gives the model of a recording.
+        recordings: one or several; the first `n_init` samples of each determine its first state.
 
     Returns:
         `whole` and `windows` (of `WINDOW` seconds) by channel; `whole_calibrated` and `windows_calibrated`
@@ -83,10 +84,10 @@ def errors(model: rf.Model | Callable[[rf.Recording], rf.Model], recordings: Rec
 
 
 def calibrated(model: rf.Model, recording: rf.Recording) -> tuple[rf.Model, float] | None:
-    """The model with the voltage offset that a recording's beginning asks for, and that offset [V].
+    """The model with a voltage offset that is fitted to the beginning of a recording, and the offset [V].
 
-    The offset with the least squared error of the first channel over the first `WINDOW` seconds, on a grid
-    that closes in. An offset that the model has already is replaced. None where the machine takes none.
+    The offset has the least squared error of the first channel over the first `WINDOW` seconds, on grids that
+    are refined. It replaces an offset that the model already has. None if the machine accepts no offset.
     """
     name = "input.voltage_offset.offset"
     try:
@@ -114,7 +115,7 @@ def calibrated(model: rf.Model, recording: rf.Recording) -> tuple[rf.Model, floa
 
 
 def _whole(pairs: Sequence[tuple[rf.Model, rf.Recording]]) -> Errors:
-    """Errors of one free run over each recording, all samples together."""
+    """Errors of one free run over each recording, over the samples of all recordings together."""
     each = []
     for model, r in pairs:
         e = (model.measured(r) - model.simulate(r))[r.n_init :]

@@ -79,8 +79,8 @@ def _parts(node: Any, wordless: bool) -> Iterator[str]:
             # Fields that some versions of Python have, and others have not, are empty here.
             if value in (None, []) or name in ("ctx", "kind", "type_comment"):
                 continue
-            if name == "body" and isinstance(value, list) and _is_text(value[0]):
-                value = value[1:]
+            if isinstance(value, list):
+                value = [part for part in value if not _is_text(part)]
             yield name
             yield from _parts(value, wordless)
     else:
@@ -88,7 +88,7 @@ def _parts(node: Any, wordless: bool) -> Iterator[str]:
 
 
 def _is_text(statement: ast.AST) -> bool:
-    """Whether a statement is nothing but a text, as docstrings are."""
+    """Whether a statement is only a string: a docstring, or the description of the constant above it."""
     return (
         isinstance(statement, ast.Expr)
         and isinstance(statement.value, ast.Constant)
@@ -108,14 +108,14 @@ class Imports:
         self._handed_on: dict[str, dict[str, tuple[str, str]]] = {}
 
     def file(self, name: str) -> Path | None:
-        """File of a module by its full name, `__init__.py` of a package; None for what is not ours."""
+        """File of a module by its full name, `__init__.py` of a package; None for other projects."""
         here = self.root if name.partition(".")[0] == "rotflex_jax" else self.root / "benchmarks"
         base = here.joinpath(*name.split("."))
         files = (base.with_suffix(".py"), base / "__init__.py")
         return next((file for file in files if file.is_file()), None)
 
     def text(self, file: Path) -> str:
-        """What a file holds."""
+        """The text of a file."""
         if file not in self._read:
             self._read[file] = file.read_text(encoding="utf-8")
         return self._read[file]
@@ -141,7 +141,7 @@ class Imports:
         return found
 
     def imported(self, name: str) -> set[str]:
-        """Full names of the modules that declare what a module imports, if they are ours."""
+        """Full names of the modules of this project that declare what a module imports."""
         file = self.file(name)
         assert file is not None, name
         found, called = set[str](), dict[str, str]()
@@ -164,7 +164,7 @@ class Imports:
         return found
 
     def _by_attributes(self, node: ast.Attribute, called: dict[str, str]) -> set[str]:
-        """What `rf.effects.Coulomb` takes, where `rf` was imported."""
+        """Modules that an expression such as `rf.effects.Coulomb` uses, where `rf` was imported."""
         names = list[str]()
         here: ast.AST = node
         while isinstance(here, ast.Attribute):
@@ -181,13 +181,13 @@ class Imports:
         return found
 
     def declares(self, source: str, name: str) -> set[str]:
-        """The module that has a name, where a package may hand it on; nothing for what is not ours."""
+        """The module that declares a name, which a package may re-export; empty for other projects."""
         file = self.file(source)
         if file is None:
             return set()
         whole = {source} if source in REGISTRIES else set()
         if file.name == "__init__.py" and name != "*":
-            # A name may be that of a folder too: `rf.fit` is the function.
+            # A name may be the name of a subpackage too: `rf.fit` is the function.
             further = self.handed_on(source).get(name)
             if further is not None and further != (source, name):
                 return whole | self.declares(*further)
@@ -195,7 +195,7 @@ class Imports:
         return whole | {inner if self.file(inner) else source}
 
     def handed_on(self, package: str) -> dict[str, tuple[str, str]]:
-        """Names that a package imports for others, from its list (`.pyi`) where it has one."""
+        """Names that a package re-exports -> their module and name there, from its `.pyi` if it has one."""
         if package not in self._handed_on:
             file = self.file(package)
             assert file is not None, package
@@ -211,7 +211,7 @@ class Imports:
 
 
 def _shows(name: str) -> bool:
-    """Whether a module writes, shows or refuses."""
+    """Whether a module only writes, shows or refuses, so that it changes no number."""
     parts = name.split(".")
     inside = parts[0] == "rotflex_jax" and len(parts) > 1
     drawn = parts[-1].split("_")[-1] in DRAWN
@@ -233,7 +233,7 @@ def _absolute(node: ast.ImportFrom, name: str, file: Path) -> str:
 
 
 def _executed(node: ast.AST) -> Iterator[ast.AST]:
-    """Nodes of a tree, imports before the rest, without what is there for type checkers alone."""
+    """Nodes of a tree, imports before the rest, without code for type checkers alone."""
     inner = list[ast.AST]()
     waiting = [node]
     while waiting:
@@ -248,7 +248,7 @@ def _executed(node: ast.AST) -> Iterator[ast.AST]:
 
 @functools.cache
 def sources(*scripts: str) -> dict[str, str]:
-    """Digests of what scripts of the benchmarks measure now, by path."""
+    """Present digests of the files that scripts of the benchmarks measure, by path."""
     imports = Imports()
     return {path: digest for script in scripts for path, digest in imports.sources(script).items()}
 
@@ -257,7 +257,7 @@ def sources(*scripts: str) -> dict[str, str]:
 
 
 def git(*command: str) -> str:
-    """What git says of the project; nothing where there is none."""
+    """Output of a git command in the folder of the project; empty without git."""
     try:
         done = subprocess.run(["git", "-C", str(ROOT), *command], capture_output=True, text=True, check=False)
     except OSError:
@@ -266,7 +266,7 @@ def git(*command: str) -> str:
 
 
 def provenance() -> dict[str, Any]:
-    """What produced the numbers."""
+    """Date, commit, digests of the code, versions and machine of a run."""
     code, arena = hashlib.sha256(), hashlib.sha256()
     for file in sorted((ROOT / "rotflex_jax").rglob("*.py")):
         code.update(file.read_bytes())
@@ -274,7 +274,7 @@ def provenance() -> dict[str, Any]:
     for file in sorted([*(HERE / "arena").glob("*.py"), *simulator.glob("*.py")]):
         arena.update(file.read_bytes())
     commit = git("rev-parse", "--short", "HEAD")
-    # Results are written while a benchmark goes on, in pieces too; they are no code.
+    # Results are written while a benchmark runs, also in parts; they are not code.
     changes = git("status", "--porcelain", "--", ".", ":!benchmarks/results", ":!docs/figures")
     return {
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
@@ -301,7 +301,7 @@ def begin(
     scripts: Sequence[str] = (),
     files: Iterable[str] = (),
 ) -> dict[str, Any]:
-    """Adds a run to a file of results, and what it measures.
+    """Adds a run to a file of results, with the digests of the files that the run measures.
 
     Args:
         results: the file, as it will be written; changed.
@@ -311,14 +311,15 @@ def begin(
         files: further files that it measures, by path from the folder of the project.
 
     Returns:
-        The entry, of which rows keep `code`.
+        The entry without its `sources`; rows of results keep its `code`.
     """
     measured = dict(sources(Path(script).stem, *scripts))
     measured |= {path: meaning((ROOT / path).read_text(encoding="utf-8")) for path in files}
     name = hashlib.sha256(json.dumps(sorted(measured.items())).encode()).hexdigest()[:12]
     made = provenance() | {"arguments": without_place(arguments)}
     run = made | {"sources": name}
-    # What was changed and not committed beside the same sources made no other numbers.
+    # A run from a clean tree replaces runs from changed trees with the same code and sources, since changes
+    # elsewhere do not affect the numbers.
     same = lambda old: (old.get("code"), old.get("sources")) == (run["code"], run["sources"])  # noqa: E731
     before = [
         old
@@ -333,7 +334,7 @@ def begin(
 
 
 def without_place(arguments: Any) -> Any:
-    """Arguments without `--out` and the file that it names, which says nothing of the results."""
+    """Arguments without `--out` and the file that it names, which does not affect the results."""
     if not isinstance(arguments, list) or "--out" not in arguments:
         return arguments
     k = arguments.index("--out")
@@ -341,7 +342,7 @@ def without_place(arguments: Any) -> Any:
 
 
 def part(results: dict[str, Any], name: str) -> None:
-    """Notes that a part of a file is of the run that was begun last."""
+    """Records that a part of a file is from the run that was begun last."""
     results.setdefault("parts", {})[name] = results["runs"][-1]["code"]
 
 
@@ -349,7 +350,7 @@ def part(results: dict[str, Any], name: str) -> None:
 
 
 class Standing(NamedTuple):
-    """Whether results are of the present code, and if not the runs that they are of and what has changed."""
+    """Whether results are from the present code; if not, the runs that they are from and what changed."""
 
     present: bool
     of: tuple[str, ...]
@@ -357,7 +358,7 @@ class Standing(NamedTuple):
 
 
 def runs_that_count(results: dict[str, Any]) -> list[dict[str, Any]]:
-    """Runs of which the file still holds something; one without a commit for rows of which no run is left."""
+    """Runs of which a file still has results; an entry without a commit for rows whose run is missing."""
     runs = list(results.get("runs") or ([results] if "commit" in results else []))
     rest = {key: value for key, value in results.items() if key not in (*KEYS, "code")}
     codes = set(results.get("parts", {}).values()) | set(_codes(rest))
@@ -368,7 +369,7 @@ def runs_that_count(results: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def _codes(found: Any) -> Iterator[str]:
-    """Versions that rows are of."""
+    """Digests of the code with which rows were measured."""
     if isinstance(found, dict):
         if isinstance(found.get("code"), str):
             yield found["code"]
@@ -380,19 +381,19 @@ def _codes(found: Any) -> Iterator[str]:
 
 
 def of_changed_tree(run: dict[str, Any]) -> bool:
-    """Whether code that was not committed made the results; a run that does not say so might be of one."""
+    """Whether the results may be from code that was not committed; a run that does not say counts as such."""
     return not run.get("commit") or run.get("clean", not run.get("changed", True)) is not True
 
 
 def standing(results: dict[str, Any], root: Path = ROOT) -> Standing:
-    """Whether what results measure is still what the files under a folder say."""
+    """Whether the files that results measure are unchanged in meaning, under a folder."""
     told, changed = list[str](), set[str]()
     present = True
     runs = runs_that_count(results)
     for run in runs:
         measured = results.get("sources", {}).get(run.get("sources"))
         other = {path for path, digest in (measured or {}).items() if _now(root / path) != digest}
-        # Runs from before tables were left out have noted them.
+        # Older runs also recorded tables, which are left out now.
         other -= {path for path in other if path.startswith("benchmarks/") and _is_table(Path(path).stem)}
         if measured and not other and not of_changed_tree(run):
             continue
@@ -409,8 +410,8 @@ def _now(file: Path) -> str:
 
 
 def _words(run: dict[str, Any]) -> str:
-    """A run by its commit."""
-    if run.get("stored"):  # from before results said what made them
+    """Text that names a run by its commit."""
+    if run.get("stored"):  # from before results recorded their runs
         return f"stored with {run['stored']}"
     if not run.get("commit"):
         return "not told"
@@ -418,7 +419,7 @@ def _words(run: dict[str, Any]) -> str:
 
 
 def remark(names: Sequence[str]) -> str:
-    """What is said beside numbers of these files of results; nothing where all are of the present code.
+    """Remark on numbers from these files of results; empty if all are from the present code.
 
     Args:
         names: files, or folders of them.
@@ -438,7 +439,7 @@ def remark(names: Sequence[str]) -> str:
 
 
 def main() -> None:
-    """Say it of every file."""
+    """Print of each file of results whether it is from the present code."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -3,15 +3,15 @@
     the error falls to <!--= B3.json silverbox/rows/6/free run/multisine .2f -->0.24<!--=--> mV
     the error falls to <!--= silverbox_multisine -->0.24<!--=--> mV
 
-The first form names a file of `results/`, the way to a number in it, if need be a unit to read it in ([deg],
-[mm] or [%]), and a format; the second a function of `claims.py`. Both forms may stand in README.md, docs/*.md
-and paper/*.md.
+The first form names a file of `results/`, the way to a number in it (keys and indices), optionally a unit in
+which to show the number ([deg], [mm], [ms] or [%]), and a format. The second form names a function of
+`claims.py`. Both forms may be used in README.md, docs/*.md and paper/*.md.
 
     <!--= versions -->Measured with an earlier version of the code: B3 (28c8341).<!--=-->
 
-says which of the results that its section quotes, and of those that it names (`versions B3.json B5`), were
-measured with code that has changed since (`origin.py`). It is put at the end of each section that needs it,
-unless it stands somewhere in the section already, and at the end of the pages in results/.
+lists the results that were measured with code that has changed since (`origin.py`), among the results that
+its section quotes and those that the mark names (`versions B3.json B5`). It is added at the end of each
+section that needs it, unless the section already has it, and at the end of the pages in results/.
 
     python benchmarks/quoted.py           # write what the results say into the documents
     python benchmarks/quoted.py --check   # exit status 1 where a document says anything else
@@ -43,7 +43,7 @@ from rotflex_jax.text.files import write_file
 
 
 def at(file: str, way: str) -> Any:
-    """What lies at the end of a way, for instance "rows/-1/free run"."""
+    """Value in a file of results at the end of a way, for instance "rows/-1/free run"."""
     here = results(file)
     for step in way.split("/"):
         here = here[int(step)] if isinstance(here, list) else here[step]
@@ -51,7 +51,7 @@ def at(file: str, way: str) -> Any:
 
 
 def quoted(source: str) -> str:
-    """The text for a mark.
+    """The present text for a mark.
 
     Raises:
         LookupError: No such name, file or way.
@@ -70,23 +70,23 @@ def quoted(source: str) -> str:
 
 
 def documents() -> list[Path]:
-    """Where marks may stand."""
+    """Documents that may contain marks."""
     found = [ROOT / "README.md", *(ROOT / "docs").glob("*.md"), *(ROOT / "paper").glob("*.md")]
     return sorted(p for p in found if p.is_file())
 
 
 def pages() -> list[Path]:
-    """What benchmarks write beside their results."""
+    """Pages that benchmarks write beside their results."""
     return sorted(p for p in RESULTS.rglob("*.md") if p.with_suffix(".json").is_file())
 
 
 def renewed(text: str) -> str:
-    """A text with what the results say now between its marks, and in each section of which code they are."""
+    """A text with the present results between its marks, and each section with its mark of versions."""
     return "".join(_section(part) for part in sections(text))
 
 
 def renewed_page(page: Path, text: str) -> str:
-    """A page of results, with a last line where they are of an earlier version of the code."""
+    """A page of results, with a last line if the results are from an earlier version of the code."""
     file = page.with_suffix(".json").relative_to(RESULTS).as_posix()
     return _marked(text, [file])
 
@@ -100,7 +100,7 @@ def sections(text: str) -> list[str]:
 
 
 def told_of(text: str) -> set[str]:
-    """The files of results that a text quotes or names, and whose version it tells where it is earlier."""
+    """The files of results that a text quotes, or that its marks of versions name."""
     ASKED.clear()
     named = set[str]()
     for mark in MARK.finditer(text):
@@ -112,14 +112,14 @@ def told_of(text: str) -> set[str]:
 
 
 def _section(text: str) -> str:
-    """One section with what the results say now."""
+    """One section with the present results between its marks."""
     files = sorted(told_of(text))
     now = lambda m: m[0] if _of_versions(m) else _mark(m["source"], quoted(m["source"]))  # noqa: E731
     return _marked(MARK.sub(now, text), files)
 
 
 def _marked(text: str, files: list[str]) -> str:
-    """A text that tells of these files, with the mark of versions where it has one or needs one."""
+    """A text that quotes these files, with its mark of versions updated, or added where one is needed."""
     said = remark(files)
     if any(_of_versions(m) for m in MARK.finditer(text)):
         return MARK.sub(lambda m: _mark(m["source"], said) if _of_versions(m) else m[0], text)

@@ -94,6 +94,8 @@ def f(x):
     [
         ("A text", "Another text", True),
         ("def f(x):", "# why\n\ndef f( x ):\n    'What it does.'", True),
+        ("    return x", "    y = x\n    'What it is.'\n    return x", False),
+        ("    return x", "    'Description of what is above.'\n    return x", True),
         ("small", "too small", True),
         ("ValueError", "TypeError", False),
         ("<", "<=", False),
