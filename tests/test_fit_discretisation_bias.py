@@ -15,6 +15,7 @@ from rotflex_jax.fit.discretisation_bias import COARSE_STEP, FinerSteps, coarse_
 from rotflex_jax.fit.problem import runs
 from rotflex_jax.fit.result import Fit
 from rotflex_jax.mechanism.finer_step import SUBSTEP_FACTOR, with_finer_steps
+from rotflex_jax.runtime.persistent_jit import release_programs
 
 COULOMB = fx.Coulomb(at="hub", level=0.02)
 FINE = rf.Exponential(substeps=SUBSTEP_FACTOR)
@@ -119,6 +120,8 @@ def test_exact_steps_are_not_checked_by_a_run(monkeypatch) -> None:
 
 
 def test_other_values_and_recordings_of_the_same_length_share_the_program(coarse) -> None:
+    # With the memory full of programs of other tests, a new one would take the place of an old one.
+    release_programs()
     rf.fit(rf.joints.paper() + COULOMB, coarse[0])
     made = len(runs)
     other = recorded([("coulomb", "hub")], seed=2)

@@ -1,4 +1,4 @@
-"""Evaluation of fitted models: errors of free runs, with and without the own offsets of a run, and estimates.
+"""Evaluation of fitted models: errors of free runs, with and without own offsets of each run, and estimates.
 
 No choice of effects depends on this module.
 """
@@ -47,7 +47,7 @@ def calibrate(problem: LikelihoodProblem, h: Hypothesis, seconds: float) -> Hypo
 
     Offsets belong to a run, not to the machine: an amplifier's offset of 0.04 V moves a servo by degrees
     within seconds. They are fitted to free runs over the first seconds, together with the first state, while
-    everything else keeps its trained value. A prior has the usual size of offsets. Errors of a free run are
+    everything else keeps its trained value. A prior expects offsets of usual size. Errors of a free run are
     correlated over about half a second, so a block of this length counts as one measurement against the
     prior. The size of the errors is common to all recordings. For a recording no longer than `seconds`, no
     data are left on which the offsets could be tested.
@@ -145,7 +145,10 @@ def _for_each(trained: Sequence[Hypothesis], count: int) -> Sequence[Hypothesis]
 
 
 def _with_own_values(s: SuperModel, h: Hypothesis, local_z: Float[np.ndarray, "R L"]) -> Hypothesis:
-    """A trained hypothesis for R recordings with given local values and no disturbance; for `model_of`."""
+    """A trained hypothesis for R recordings with given local values and no periodic disturbance.
+
+    Only for `ValidationSet.model_of`: first states and gains are copies of those of the first recording.
+    """
     return dataclasses.replace(
         h,
         local_z=local_z * [i not in s.phased for i in h.local],
@@ -318,7 +321,7 @@ class PairedEstimates(NamedTuple):
 
 
 def disagreement(pairs: Sequence[PairedEstimates], location: EffectLocation) -> str:
-    """A clause that the size of an effect differs between recordings, or is not determined; else empty.
+    """A clause that the size of an effect differs between recordings, or is not determined; otherwise empty.
 
     Args:
         pairs: Pairs of fits to compare.

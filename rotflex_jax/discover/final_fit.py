@@ -181,7 +181,7 @@ class _LastFit:
         return self.stage.calibrated or self.carried_over
 
     def made(self, h: Hypothesis) -> FinalFit | Refused:
-        """The final fit of a model; if all are refused, why the fit from measured first states was."""
+        """The final fit of a model; if all are refused, why the one from measured first states is."""
         state, seconds, s = self.state, self.state.validation.window_seconds, self.state.problem.supermodel
         variants = {v.locations: v for v in (h, with_all_calibrations(s, h))}
         structures = [
@@ -450,7 +450,7 @@ def log_error_ratio(a: RunErrors, b: RunErrors) -> float:
 
 
 def _without_each(train: Sequence[Recording]) -> list[list[Recording]]:
-    """Training recordings without each one in turn; if there are more than three, without a third of them."""
+    """Training recordings without each one in turn; of more than three, without each third in turn."""
     folds, each = min(len(train), MOST_FOLDS), range(len(train))
     return [[train[k] for k in each if k % folds != fold] for fold in range(folds)]
 

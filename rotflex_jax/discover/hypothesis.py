@@ -248,7 +248,7 @@ def with_effect(s: SuperModel, h: Hypothesis, start: CandidateStart, share: floa
     size = np.abs(np.array(c.probes[0])).max(axis=0)
     values = np.where(c.amplitudes, share * start.values, start.values)
     for k, spec in enumerate(specs):
-        # A lower bound is at minus infinity of the unconstrained coordinate, so the start is a little above.
+        # A lower bound is at minus infinity of the unconstrained coordinate: the start is a little above it.
         if np.isfinite(spec.lower) and k != c.line:
             values[k] = max(values[k], spec.lower + 0.05 * share * max(size[k], 1e-12))
     z = h.z.copy()

@@ -291,7 +291,7 @@ def in_blocks(values: Float[np.ndarray, "R N"], data: StackedRecordings) -> Floa
 # leave tens of nats on a long recording and cause false discoveries.
 MIN_DECREASE_NATS = 0.3
 # The damping is small from the start, since a refit starts near its optimum. Refused steps raise it quickly.
-# At 100 a step is a hundredth of a scaled gradient step, and a fit whose cost does not fall by it ends.
+# At 100 a step is a hundredth of a scaled gradient step; a fit whose cost does not fall by such a step ends.
 REFIT_RULES = Rules(enough=MIN_DECREASE_NATS, damping=1e-4, least=1e-9, increase=20, largest=100)
 # Largest number of steps of a fit.
 MAX_STEPS = 12

@@ -97,7 +97,7 @@ def promising_pairs(prediction: ScoreTest, free_run: ScoreTest) -> list[tuple[Pa
 def best_refitted(
     s: SuperModel, current: ValidatedHypothesis, known: Sequence[ValidatedHypothesis]
 ) -> tuple[PairStart, PairStart] | None:
-    """The two effects with the largest gains on validation data when each was added to a model alone.
+    """The two effects with the largest gains on validation data when each alone was added to a model.
 
     They are the effect with the largest gain in predictions and the one with the largest gain in free runs.
     If these are one effect, or laws of the same thing, the effect with the largest sum of both gains (as

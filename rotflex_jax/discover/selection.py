@@ -78,7 +78,7 @@ def horizon_gains(
 
 
 def helps(gain: HorizonGain) -> bool:
-    """Whether a gain at one horizon is positive by more than 1.5 standard deviations."""
+    """Whether a gain at one horizon is positive by more than `HELD_OUT_Z` standard deviations."""
     return gain.z > HELD_OUT_Z and gain.gain > 0
 
 
@@ -233,7 +233,7 @@ def choose(
     winner = max(able, key=lambda t: shares[t.location])
 
     def simplest(t: ValidatedHypothesis) -> ValidatedHypothesis:
-        """The best effect that `t` contains and is not clearly better than; `t` itself without any."""
+        """The best effect that `t` contains and is not clearly better than; `t` itself if there is none."""
         simpler = [x for x in able if _contained(x, t) and not _clearly_better(t, x, current)]
         return max(simpler, key=lambda x: shares[x.location], default=t)
 
@@ -335,7 +335,7 @@ def replaced_by(
     after: Sequence[list[Score]],
     tried: Sequence[EffectLocation],
 ) -> list[EffectLocation]:
-    """Candidates with a high score without the winner and none with it: the winner may stand in their place.
+    """Candidates whose high score the winner takes away almost entirely: it may stand in their place.
 
     Two effects may do nearly the same in the motion of a recording, such as a dead zone of the input and
     friction at a hub that stops at every reversal. Adding one of them then removes the score of the other.

@@ -2,7 +2,7 @@
 
 As in `Model.simulate_windows`, positions and speeds at the start of a window come from its first samples. For
 states that no sensor measures, values are given here, while `Model.simulate_windows` takes them from a run
-over the whole recording. It is not used here, since it would be compiled anew for every candidate.
+over the whole recording. That method is not used here, since it would be compiled anew for every candidate.
 """
 
 import dataclasses
@@ -56,8 +56,8 @@ class ShortRuns:
         """Outputs of free runs over each recording; as measured where a sample does not count.
 
         Args:
-            run: Parameters and first states (R, W, m). First positions and speeds are fitted, from the values
-                given here; other states keep their values. The gain is not used.
+            run: Parameters and first states (R, W, m). First positions and speeds are fitted, starting from
+                those of `windows`; other states keep the values given here. The gain is not used.
             directions: Number of directions of the compiled slopes: the number that fits of this structure
                 have, and at least one for each coordinate of a first state.
         """
@@ -136,7 +136,7 @@ class ValidatedHypothesis:
     folds: tuple[Hypothesis, ...] = ()
 
     def with_trained_calibrations(self, s: SuperModel) -> Hypothesis:
-        """The hypothesis on the validation recordings, with the calibrations of the training recordings.
+        """The hypothesis on the validation recordings, with the mean calibrations of training recordings.
 
         The phase of a periodic disturbance keeps its adapted value, since recordings never share it.
 

@@ -42,7 +42,7 @@ def rival_set(
             that not all models have.
         Ts: Sampling period [s].
         noise: Channel -> standard deviation of the sensor noise; from the fits if None.
-        process_noise: Port -> intensity of the process torque [(N m)^2 s]; None for free runs.
+        process_noise: Port -> intensity of the process noise [(N m)^2 s]; None for free runs.
         uncertainty: Standard deviation of parameters for which none is known, as a share of their value.
 
     Raises:

@@ -126,7 +126,7 @@ def next_experiment(
         seconds: Length of the experiment [s].
         Ts: Sampling period [s].
         noise: Channel -> standard deviation of the sensor noise.
-        process_noise: Port -> intensity of the process torque in the fit [(N m)^2 s]; None for a free run.
+        process_noise: Port -> intensity of the process noise in the fit [(N m)^2 s]; None for a free run.
         reference: Voltage of the recording that does not distinguish the two effects [V]; noise if None.
         improve: Whether to optimise the best standard inputs, or only to rank them.
         starts: Number of standard inputs to optimise.

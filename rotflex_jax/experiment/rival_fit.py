@@ -115,7 +115,7 @@ def rival_model(
         effect: The effect: an instance with its parameters, `name@port` or a pair. Without an instance, the
             parameters come from the model if it has the effect, otherwise from the catalogue.
         other: Effect and port of the rival, which is removed.
-        process_noise: Port -> intensity of the process torque [(N m)^2 s].
+        process_noise: Port -> intensity of the process noise [(N m)^2 s].
         noise: Standard deviation of the sensor noise of each channel.
         Ts: Sampling period [s].
     """

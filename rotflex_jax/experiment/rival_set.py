@@ -163,7 +163,7 @@ class RivalSet:
         prior_mean: Prior mean of the unconstrained free parameters of each model.
         prior_covariance: Covariance of these parameters.
         noise: Standard deviation of the sensor noise of each channel.
-        process_noise: Port -> intensity of the process torque [(N m)^2 s].
+        process_noise: Port -> intensity of the process noise [(N m)^2 s].
         Ts: Sampling period [s].
     """
 

@@ -64,7 +64,7 @@ def experiment_until(
             segment is played in pieces of this length, and stopped early when it is decided. None for whole
             segments.
         noise: Channel -> standard deviation of the sensor noise; from the fits if None.
-        process_noise: Port -> intensity of the process torque [(N m)^2 s]; None for free runs.
+        process_noise: Port -> intensity of the process noise [(N m)^2 s]; None for free runs.
         uncertainty: Standard deviation of parameters for which none is known, as a share of their value.
         improve: Whether inputs are improved by gradient ascent; otherwise standard inputs are played.
         seed: Seed of standard inputs and draws.

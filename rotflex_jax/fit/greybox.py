@@ -156,16 +156,16 @@ def fit(
     a little earlier shifts everything that follows. If the first attempt starts far from the motion, or does
     not converge, a second attempt begins with short predictions, which are easy to match from far away. If
     errors of free runs are then still far above the noise, or no attempt has converged, the fit restarts. The
-    first restart begins at the same parameters with free runs of 0.2 s (longer if there would be more than
+    first restart begins at the given parameters with free runs of 0.2 s (longer if there would be more than
     200 of them), and goes on with longer free runs up to the length of the fit. Further restarts begin at
     random parameters around the best end, alternately near it and far from it, until three ends have the same
     cost. The end with the least cost is the result.
 
     A fit has converged if steps bring less than a small part of a standard deviation of the parameters. If
-    errors are correlated over many samples, this corresponds to as many nats. Parameters stay within the
-    physical range that their effects declare; a damper may be negative as long as the damping of its port is
-    not. A parameter at an end of its range, or of a size far beyond what the recordings reach, is named in
-    `remarks`.
+    errors are correlated over many samples, this limit is larger in nats, since the likelihood then counts
+    the same information many times. Parameters stay within the physical range that their effects declare; a
+    damper may be negative as long as the damping of its port is not. A parameter at an end of its range, or
+    of a size far beyond what the recordings reach, is named in `remarks`.
 
     One integration step per sample is too long for some effects, above all for dry friction. If an estimate
     would move by more than a standard deviation with shorter steps, and the recordings are no less likely
@@ -180,8 +180,9 @@ def fit(
         first: "fitted" to fit first states; "measured" to hold them at what the first `n_init` samples show.
             Where nothing returns the machine to a position, fitted first states hide a drift of the model.
         window_seconds: Length of windows after which free runs start again [s], each time from a first state
-            of its own. Delays and lags continue across windows, and memories start from the values that a run
-            over the whole recording has there, as in the errors over windows.
+            of its own: the parameters are then the best ones for free runs of this length. Delays and lags
+            continue across windows, and memories start from the values that a run over the whole recording
+            has there, as in the errors over windows.
         robust: Errors beyond this many standard deviations count linearly and not by their square. Use it,
             for instance with 1.5, if the model is far off for some of the time and should be right for the
             rest. The standard deviation follows from the median of the errors; `noise` and intervals are

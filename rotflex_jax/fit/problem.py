@@ -249,7 +249,7 @@ def free_run_slopes(
     Args:
         layout: Mechanism and solver, and the number of entries of the first state that have slopes.
         values: Parameter values.
-        scale: Unit of each parameter for its slope.
+        scale: Change of each parameter to which its slope refers.
         free: Indices of the free parameters.
         start: First state.
         u: Input, with signals in further columns.

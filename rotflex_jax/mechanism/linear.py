@@ -140,7 +140,7 @@ def kalman_gains(
     noise: Float[np.ndarray, " C"] | Sequence[float],
     Ts: float,
 ) -> Float[np.ndarray, "Q n C"]:
-    """Steady Kalman gains of the linear part under white process torques at some ports.
+    """Steady Kalman gains of the linear part under process noise (white torques) at some ports.
 
         x+ = Ad (x + K e) + Bd u,   K = P C' (C P C' + R)^-1,   P from the discrete Riccati equation
 

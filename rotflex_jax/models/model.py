@@ -333,7 +333,7 @@ class Model:
 
         Args:
             recording: Voltage and measured outputs.
-            process_noise: Port -> intensity of a white process torque [(N m)^2 s].
+            process_noise: Port -> intensity of the process noise [(N m)^2 s].
             noise: Standard deviation of the sensor noise of each channel.
         """
         y, m = self.measured(recording).astype(float), self.mechanism

@@ -70,7 +70,7 @@ class Recording:
         accept: faults to accept, which then are findings of severity `warning`: `short`,
             `constant_input`, `constant`, `saturated`, `units`, `absolute`, `swapped`, `huge`, `slow`,
             `wrapped`, `outliers`, `frozen`.
-        resolution: quantisation step of a channel, if it is known; otherwise it is found from the data.
+        resolution: channel -> its quantisation step, if it is known; otherwise it is found from the data.
         continues: the recording that ended where this one starts, if any. A part of a recording has the part
             before it. States that no sensor measures (the temperature of a motor) continue from there.
         remarks: findings on the source, such as lost rows. Parts of the recording keep them.
@@ -344,7 +344,7 @@ class Recording:
             std = plain_number(factor * float(np.std(values)))
             rows.append((name, read, f"{plain_number(low)} … {plain_number(high)}", std, quantum))
             lines = [(factor * np.asarray(values, float), FINAL, "")]
-            label = f"{name} [{read}]"  # an axis has room for so much; the table has all
+            label = f"{name} [{read}]"  # an axis has room for 15 characters; the table has all
             panels.append(svg.Panel(label if len(label) <= 15 else f"{label[:14]}…", lines))
         rate = f"{self.N} samples, {self.duration:g} s at {1 / self.Ts:g} Hz"
         return card(

@@ -48,7 +48,8 @@ _PACKAGE, _SOURCES = __name__.partition(".")[0], sorted(Path(__file__).parents[1
 # The source that this process has loaded; nothing is stored if a file has changed since about that time.
 _LOADED, _ABOUT = time.time(), 10.0
 _SOURCE = hashlib.sha256(b"".join(file.read_bytes() for file in _SOURCES)).hexdigest()
-# Number of versions whose programs stay on disk: of the package, of JAX with its settings, of the processor.
+# Number of versions whose programs stay on disk; another source of the package, another JAX or setting of it,
+# and another processor each make a version.
 _VERSIONS = 6
 # Settings on which tracing depends and which a context may change.
 _SETTINGS = ("jax_enable_x64", "jax_default_matmul_precision")
