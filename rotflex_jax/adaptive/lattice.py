@@ -164,7 +164,7 @@ class VolterraLattice(AdaptiveFilter):
 
     @property
     def size(self) -> int:
-        """Number of weights: one for a constant, M linear and M (M + 1) / 2 quadratic ones."""
+        """Number of weights, with one for a constant, M linear and M (M + 1) / 2 quadratic ones."""
         return len(monomials(self.memory)) + self.constant
 
     @property

@@ -227,7 +227,7 @@ class Moments:
 
     @property
     def condition(self) -> float:
-        """Condition number of R: ratio of the slowest to the fastest time constant of LMS."""
+        """Condition number of R, the ratio of the slowest to the fastest time constant of LMS."""
         values = self.eigenvalues
         return float(values[-1] / values[0]) if values[0] > 0 else float("inf")
 

@@ -534,7 +534,7 @@ class SearchResult:
 
     @property
     def model(self) -> Model:
-        """The model to use: the model of the final fit if there is one, else the model after the last round.
+        """The model to use, from the final fit if there is one, else from the last round.
 
         The stages report errors of `final.model`, which was fitted to the training recordings alone.
         """

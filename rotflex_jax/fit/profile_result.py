@@ -137,7 +137,7 @@ class Profile:
 
     @property
     def wald_is_poor(self) -> bool:
-        """Whether Wald's interval misleads: the profile is not closed, or an end has another level."""
+        """Whether Wald's interval misleads, because the profile is not closed or an end has another level."""
         if not math.isfinite(self.std) or self.shape != "closed":
             return True
         at = self.root_at(np.array(self.wald))

@@ -407,7 +407,7 @@ class Mechanism:
 
     @property
     def free_names(self) -> tuple[str, ...]:
-        """Parameters that a fit estimates: all except the trusted ones."""
+        """Parameters that a fit estimates, which are all except the trusted ones."""
         return tuple(n for n in self.parameter_names if n not in self.trusted)
 
     def with_values(
