@@ -327,13 +327,15 @@ _OF_STAGES = {
     "feedback to lqr": "2011 to 2026",
     "lqr and half of feedback to the rest": "2026 and half of 2011 to the rest",
     "feedback and half of lqr to the rest": "2011 and half of 2026 to the rest",
-    "first 70 % of all to the rest": "first 70 % of both to the rest",
 }
-for _stage, _ways in ((1, list(_OF_STAGES)[:6]), (2, list(_OF_STAGES))):
-    for _way in _ways:
-        MEASURED_DIRECTIONS[f"two_dof_link_{_stage}: {_way}"] = (
-            f"two-link machine, stage {_stage}, {_OF_STAGES[_way]}"
-        )
+MEASURED_DIRECTIONS |= {
+    f"two_dof_link_{stage}: {way}": f"two-link machine, stage {stage}, {runs}"
+    for stage in (1, 2)
+    for way, runs in _OF_STAGES.items()
+}
+MEASURED_DIRECTIONS["two_dof_link_2: first 70 % of all to the rest"] = (
+    "two-link machine, stage 2, first 70 % of both to the rest"
+)
 
 
 def _whole_and_windows(errors: dict[str, Any], name: str, channel: str) -> str:
