@@ -190,7 +190,7 @@ def test_an_offset_of_the_one_run_that_it_hardly_needs_is_left_out(arm, monkeypa
         worse = 9 if kept_for == "validation data" and not structure.on else 1
         return RunErrors(errors.whole, {c: worse * e for c, e in errors.windows.items()})
 
-    monkeypatch.setattr(MODULE._LastFit, "runs_prefer", prefer)
+    monkeypatch.setattr(MODULE._FinalFitBuilder, "runs_prefer", prefer)
     monkeypatch.setattr(MODULE, "_on_validation", far_off)
     if not kept_for:
         monkeypatch.setattr(MODULE, "MOST_WORSE", np.inf)
@@ -434,7 +434,7 @@ def comparing(recordings: list[Any]) -> Any:
         validation=SimpleNamespace(window_seconds=2.0, folds=True),
         problem=SimpleNamespace(dataset=SimpleNamespace(recordings=tuple(recordings))),
     )
-    return MODULE._LastFit(state, cast(Any, None), cast(Any, None))
+    return MODULE._FinalFitBuilder(state, cast(Any, None), cast(Any, None))
 
 
 def test_free_runs_are_compared_by_the_likelihood_of_half_seconds(arm, runs):
@@ -464,7 +464,7 @@ def test_a_law_is_preferred_where_free_runs_are_better_everywhere(falls, smaller
     a, b = (SimpleNamespace(noise={"theta": x}) for x in (np.exp(-smaller), 1.0))
     two = [before[:2], before[2:]]
     better = [x + f for x, f in zip(two, np.split(np.array(falls), 2), strict=True)]
-    monkeypatch.setattr(MODULE._LastFit, "blocks", lambda self, f: better if f is a else two)
+    monkeypatch.setattr(MODULE._FinalFitBuilder, "blocks", lambda self, f: better if f is a else two)
     assert last.runs_prefer(a, b) == preferred
 
 
@@ -479,7 +479,7 @@ def test_what_every_run_has_to_prefer_helps_each(second, preferred, monkeypatch)
     last, before = comparing([]), [np.arange(6.0)] * 2
     a, b = (SimpleNamespace(noise={"theta": x}) for x in (0.5, 1.0))
     after = [before[0] + np.tile([5.0, 6.0], 3), before[1] + np.tile(second, 3)]
-    monkeypatch.setattr(MODULE._LastFit, "blocks", lambda self, f: after if f is a else before)
+    monkeypatch.setattr(MODULE._FinalFitBuilder, "blocks", lambda self, f: after if f is a else before)
     assert last.runs_prefer(a, b)
     assert last.runs_prefer(a, b, every=True) == preferred
 
@@ -597,7 +597,7 @@ def test_a_clearly_worse_way_is_not_taken(runs, arm, monkeypatch, share, said):
         arm, train, validation, candidates=[], rounds=0, calibrate_seconds=0.0
     )
     theirs = search().final.held_out_rmse_windows["theta"]
-    tried, limit = MODULE._LastFit.tried, float(np.exp(share * MOST_WORSE) * theirs)
+    tried, limit = MODULE._FinalFitBuilder.tried, float(np.exp(share * MOST_WORSE) * theirs)
 
     def on_validation(structure, trained, evaluation):
         return RunErrors({"theta": 0.0}, {"theta": 0.9 * theirs})
@@ -611,7 +611,7 @@ def test_a_clearly_worse_way_is_not_taken(runs, arm, monkeypatch, share, said):
         ]
 
     monkeypatch.setattr(MODULE, "_on_validation", on_validation)
-    monkeypatch.setattr(MODULE._LastFit, "tried", alone)
+    monkeypatch.setattr(MODULE._FinalFitBuilder, "tried", alone)
     found = search()
     assert (found.final_fit is None) == (said is not None)
     assert [note.endswith(said or "") for note in refusals(found)] == [True] * (said is not None)
@@ -620,14 +620,14 @@ def test_a_clearly_worse_way_is_not_taken(runs, arm, monkeypatch, share, said):
 def test_where_measured_first_states_do_worse_the_fit_is_with_fitted_ones(runs, arm, monkeypatch):
     """As the search fits, from its parameters alone, and to all recordings: friction of both runs counts."""
     train, validation, test = runs
-    tried = MODULE._LastFit.tried
+    tried = MODULE._FinalFitBuilder.tried
 
     def worse_from_measured(last, structures):
         each = tried(last, structures)
         lost = RunErrors({"theta": np.inf}, {"theta": np.inf})
         return [t._replace(errors=lost) if t.structure.first == "measured" else t for t in each]
 
-    monkeypatch.setattr(MODULE._LastFit, "tried", worse_from_measured)
+    monkeypatch.setattr(MODULE._FinalFitBuilder, "tried", worse_from_measured)
     found = rf.discover(arm, train, validation, test=test, candidates=LAWS[:1], rounds=1)
     last = found.final_fit
     assert last.fit.options.first == found.to_dict()["final_fit"]["first"] == "fitted"
@@ -648,7 +648,7 @@ def test_errors_that_differ_by_less_than_a_tenth_are_not_distinguished(runs, arm
     search = lambda: rf.discover(  # noqa: E731
         arm, train, validation, candidates=[], rounds=0, calibrate_seconds=0.0
     )
-    theirs, tried, alone = search().final.held_out_rmse_windows["theta"], MODULE._LastFit.tried, []
+    theirs, tried, alone = search().final.held_out_rmse_windows["theta"], MODULE._FinalFitBuilder.tried, []
 
     def without_validation_data(last, structures):
         alone.extend(tried(last, structures))
@@ -658,7 +658,7 @@ def test_errors_that_differ_by_less_than_a_tenth_are_not_distinguished(runs, arm
         return RunErrors({"theta": 0.0}, {"theta": float(np.exp(0.1 * share if alone else 0.0) * theirs)})
 
     monkeypatch.setattr(MODULE, "_on_validation", on_validation)
-    monkeypatch.setattr(MODULE._LastFit, "tried", without_validation_data)
+    monkeypatch.setattr(MODULE._FinalFitBuilder, "tried", without_validation_data)
     assert (search().final_fit is not None) == taken
 
 
@@ -763,10 +763,10 @@ def fewer_effects(needed=(), spoken_for=(), refused=()):
         fitted_to_all=lambda tried: fitted(tried.structure.on, "all"),
         accepted=lambda c: MODULE.Refused("") if set(refused) - set(c.fitted.structure.on) else (),
     )
-    last.without = functools.partial(MODULE._LastFit.without, last)
+    last.without = functools.partial(MODULE._FinalFitBuilder.without, last)
     (found,) = tried([SimpleNamespace(on=every, start="training")])
     candidate = MODULE._Candidate(found, last.fitted_to_all(found), laws=((COULOMB_HUB, LUGRE_HUB),))
-    return MODULE._LastFit.without_needless_effects(last, candidate), said, last
+    return MODULE._FinalFitBuilder.without_needless_effects(last, candidate), said, last
 
 
 def test_effects_that_free_runs_hardly_need_are_not_in_the_model_to_use():

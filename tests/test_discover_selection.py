@@ -516,6 +516,49 @@ def test_the_richer_effect_runs_as_well_within_a_hundredth(side: float) -> None:
     assert richer_wins(windows=5.0 * np.exp(0.01 * side)) is (side < 1)
 
 
+def richer_wins_by_runs(
+    validation: float = -0.5,
+    training: float = 3.0,
+    runs: float = 2.0,
+    error: float = 0.12,
+    gain: float = 300.0,
+) -> bool:
+    """Whether Stribeck friction, which predictions of validation data do not prefer, is chosen.
+
+    Args:
+        validation: Standard deviations by which predictions of validation data prefer it to Coulomb friction.
+        training: The same for predictions of training data.
+        runs: The same for free runs, of training and of validation data each.
+        error: Logarithm by which its free runs have smaller errors.
+        gain: Gain of predictions of training data [nat].
+    """
+    lost, scatter = gain * validation / training, scatter_for(training, gain)
+    before = {"held_out": 2000.0, "train": 2000.0, "windows": 5.0}
+    predictions = {"held_out": 2000.0 + lost, "train": 2000.0 + gain, "scatter": scatter}
+    free_runs = {"held_out": 2400.0, "train": 2400.0, "scatter": scatter_for(runs, 400.0)}
+    windows = {"windows": 5.0 * np.exp(-error)}
+    plain = at_both(before, before, COULOMB)
+    rich = at_both(predictions | windows, free_runs | windows, STRIBECK)
+    rich = dataclasses.replace(rich, parameter_count=3)
+    return choose([plain, rich], FAR, MEASURED, NOISE)[0] is rich
+
+
+@SIDES
+@pytest.mark.parametrize("what", ["validation", "training", "runs", "error", "gain"])
+def test_a_richer_effect_may_be_preferred_by_all_but_validation_predictions(side: float, what: str) -> None:
+    """Two laws of friction may differ by less than the scatter in predictions of a short validation run."""
+    penalty = 8.0 + 0.5 * 2 * np.log(MEASURED)
+    limits = {"training": 2.0, "runs": 1.5, "error": 0.1, "gain": penalty}
+    value = -1.5 / side if what == "validation" else limits[what] * side
+    assert richer_wins_by_runs(**{what: value}) is (side > 1)
+
+
+def test_runs_that_prefer_a_richer_effect_need_its_own_fit_to_free_runs() -> None:
+    plain = trial(COULOMB, held_out=2000.0, train=2000.0, windows=5.0)
+    rich = trial(STRIBECK, held_out=1990.0, train=2300.0, windows=4.0, scatter=2.0, numbers=3)
+    assert choose([plain, rich], BASE, MEASURED, NOISE)[0] is plain
+
+
 @SIDES
 def test_runs_are_clearly_better_by_a_hundredth(side: float) -> None:
     a, b = 5.0 * np.exp(-0.01 * side) * NOISE, 5.0 * NOISE

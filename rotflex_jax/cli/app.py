@@ -127,9 +127,9 @@ def discover(
     train, validation = columns.load_all(files), columns.load_all(held_out or [])
     if not validation and (len(train) == 1 or split is not None):
         train, validation = map(list, zip(*(recording.split(share) for recording in train), strict=True))
-    no_say = columns.load_all(test or [])
+    test_recordings = columns.load_all(test or [])
     options = {"calibrate_seconds": calibrate, "resume": resume}
-    _discover(model, train, validation, report, json_file, save_model, test=no_say, **options)
+    _discover(model, train, validation, report, json_file, save_model, test=test_recordings, **options)
 
 
 @reads_files

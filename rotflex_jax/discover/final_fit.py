@@ -91,7 +91,7 @@ def fit_to_all(
         return _refused(state, "it has a periodic disturbance, whose phase no other recording shares")
     state.say("fitting the chosen structure to all training and validation recordings")
     try:
-        return _LastFit(state, stage, evaluation).made(final.hypothesis)
+        return _FinalFitBuilder(state, stage, evaluation).made(final.hypothesis)
     except InputError as error:  # some recordings cannot be fitted alone; the result of the search remains
         return _refused(state, str(error).rstrip("."))
 
@@ -145,7 +145,7 @@ class _Candidate(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class _LastFit:
+class _FinalFitBuilder:
     """The final fit of one search.
 
     Attributes:

@@ -227,17 +227,15 @@ def replacing(
 ) -> Hypothesis:
     """The hypothesis with a richer effect that replaces simpler ones and takes over their parameters."""
     values, known = h.mean_values(s), {}
+    name = [full.rpartition(".")[2] for full in s.mechanism.parameter_names]  # without port and effect
     for location in simpler:
-        indices = s.parameter_indices(location)
-        names = [s.mechanism.parameter_names[i].rpartition(".")[2] for i in indices]
-        known |= dict(zip(names, values[indices], strict=True))
+        known |= {name[i]: values[i] for i in s.parameter_indices(location)}
         h = without(s, h, location)
     c, own = s.candidates[start.location], start.values.copy()
     for k, i in enumerate(c.parameters):
-        parameter = s.mechanism.parameter_names[i].rpartition(".")[2]
-        if parameter in known:
+        if name[i] in known:
             # Parameters of the simpler effect keep their size; only other amplitudes get the share.
-            own[k] = known[parameter] / (share if c.amplitudes[k] else 1.0)
+            own[k] = known[name[i]] / (share if c.amplitudes[k] else 1.0)
     return with_effect(s, h, dataclasses.replace(start, values=own), share)
 
 

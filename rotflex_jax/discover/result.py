@@ -475,7 +475,7 @@ class Where:
         }
 
 
-def longest_with_a_say(train: Sequence[Recording], validation: Sequence[Recording]) -> Recording:
+def longest_recording(train: Sequence[Recording], validation: Sequence[Recording]) -> Recording:
     """The longest training or validation recording, the first of several equally long ones.
 
     `SearchResult.where` is about this recording.

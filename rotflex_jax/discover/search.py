@@ -27,7 +27,7 @@ from rotflex_jax.discover.likelihood import (
     finer_integration,
 )
 from rotflex_jax.discover.pairs import pairs_passed_by
-from rotflex_jax.discover.result import longest_with_a_say
+from rotflex_jax.discover.result import longest_recording
 from rotflex_jax.discover.search_state import Progress, SearchState, as_it_was, fit_as_it_is
 from rotflex_jax.discover.selection import is_poor
 from rotflex_jax.discover.stepwise import (
@@ -250,7 +250,7 @@ def _make_ahead(state: SearchState, evaluation: Evaluation) -> None:
     if fine := finer_integration(state.reported.problem, h):
         fine.make_ahead([h])
     deciding = (p.dataset.recordings for p in (state.problem, state.validation.problem))
-    evaluation.make_ahead(state.current, longest_with_a_say(*deciding))
+    evaluation.make_ahead(state.current, longest_recording(*deciding))
 
 
 def _simplify(state: SearchState) -> None:

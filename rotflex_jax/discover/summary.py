@@ -34,7 +34,7 @@ from rotflex_jax.discover.result import (
     assess_stages,
     conditional_note,
     excluding,
-    longest_with_a_say,
+    longest_recording,
 )
 from rotflex_jax.discover.search_state import SearchState
 from rotflex_jax.discover.selection import helps
@@ -103,7 +103,7 @@ def evaluate_models(state: SearchState, evaluation: Evaluation) -> EvaluatedMode
 
     stages = on_threads(stage, range(len(models)))
     train, held_back = problem.dataset.recordings, validation.problem.dataset.recordings
-    longest, channels = longest_with_a_say(train, held_back), model.mechanism.channels
+    longest, channels = longest_recording(train, held_back), model.mechanism.channels
     seconds, noise = validation.window_seconds, problem.noise
     as_it_is = built.model_of(models[0], (), 0)
     residual = model.measured(longest) - as_it_is.simulate_windows(longest, seconds)

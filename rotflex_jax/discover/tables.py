@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rotflex_jax.discover.explanation import advice, coloured_sensors
-from rotflex_jax.discover.result import Ranked, Round, RunErrors, SearchResult, longest_with_a_say
+from rotflex_jax.discover.result import Ranked, Round, RunErrors, SearchResult, longest_recording
 from rotflex_jax.discover.verdict import Grade, Verdict, grade
 from rotflex_jax.effects.base import full_name
 from rotflex_jax.effects.labels import effect_label, effect_phrase
@@ -115,7 +115,7 @@ def error_lists(discovery: SearchResult) -> list[NamedErrors]:
         ", each recording with " + _own_offsets(stages[0].calibrate_seconds, recordings)
         for recordings in (discovery.validation, discovery.test)
     )
-    chose, no_say = "The model was chosen on these recordings.", "Used for no fit and no choice."
+    chose, not_used = "The model was chosen on these recordings.", "Used for no fit and no choice."
     if not discovery.test:
         chose += " Test recordings (test=), used for no fit and no choice, would give an unbiased error."
     tested = (last.test, last.test_calibrated) if last else (None, None)
@@ -127,8 +127,8 @@ def error_lists(discovery: SearchResult) -> list[NamedErrors]:
             None,
         ),
         ("Validation data" + own, chose, [s.calibrated for s in stages], None),
-        ("Test data", no_say, [s.test for s in stages], tested[0]),
-        ("Test data" + own_tested, no_say, [s.test_calibrated for s in stages], tested[1]),
+        ("Test data", not_used, [s.test for s in stages], tested[0]),
+        ("Test data" + own_tested, not_used, [s.test_calibrated for s in stages], tested[1]),
     ]
     found = []
     for title, note, of_stages, of_fit in listed:
@@ -230,7 +230,7 @@ def where_sentence(discovery: SearchResult, recording: Recording | None = None) 
         discovery: The result.
         recording: One of its recordings; if None, the recording on which the baseline was localised.
     """
-    r = recording or longest_with_a_say(discovery.train, discovery.validation)
+    r = recording or longest_recording(discovery.train, discovery.validation)
     fitted = any(r is other for other in discovery.train)
     named = f"{r.source}, " if r.source else ""
     return (

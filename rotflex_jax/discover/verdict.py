@@ -105,12 +105,12 @@ class Assessment:
             return f"the error of {worst} in short runs is above {NEAR_FLOOR:g} times the sensor noise"
         if not self.torque_free:
             return (
-                f"short runs are at the noise, but predictions still ask for a random torque "
+                f"short runs are at the noise, but predictions are likelier with a random torque "
                 f"({self.torque_nats:.2g} nat per measured value, at most {TORQUE_NATS:g})"
             )
         return (
-            f"short runs are within {NEAR_FLOOR:g} times the sensor noise, and predictions ask for "
-            "no random torque"
+            f"short runs are within {NEAR_FLOOR:g} times the sensor noise, and predictions are no likelier "
+            "with a random torque"
         )
 
     @property
