@@ -1,4 +1,4 @@
-"""Two candidates at once: the joint score is dense least squares, and which pairs are worth a refit."""
+"""Pairs of candidates: the joint score against dense least squares, and the choice of pairs to refit."""
 
 import dataclasses
 from types import SimpleNamespace
@@ -47,12 +47,12 @@ SAMPLES = 60
 def candidate(name: str, port: str, probes, one_sided=False, threshold=False) -> Candidate:
     k = len(probes[0][0])
     return Candidate(
-        EffectLocation(name, port), 0, tuple(range(k)), probes, (True,) * k, one_sided, threshold
+        EffectLocation(name, port), 0, tuple(range(k)), probes, (True,) * k, (True,) * k, one_sided, threshold
     )
 
 
 def made(candidates: list[Candidate], slopes: dict, r: np.ndarray) -> ScoreTest:
-    """A test with slopes made by hand, of which the hypothesis explains none."""
+    """A score test with given derivatives, of which the baseline explains none."""
     columns = {key: [_Column(float(np.linalg.norm(x)), x) for x in rows] for key, rows in slopes.items()}
     projected = _Projected(r, columns, float(SAMPLES), 1.0)
     listed = sorted((_score(c, projected) for c in candidates), key=lambda s: -s.nats)
@@ -60,7 +60,7 @@ def made(candidates: list[Candidate], slopes: dict, r: np.ndarray) -> ScoreTest:
 
 
 def dense(slopes: list[np.ndarray], r: np.ndarray, lower: list[float], upper: list[float]) -> float:
-    """What least squares within bounds takes from half the squared residual."""
+    """Reduction of half the squared residual by bounded least squares of scipy."""
     J = np.vstack(slopes).T
     found = lsq_linear(J, -r, (lower, upper), tol=1e-13)
     return float(0.5 * r @ r - found.cost)
@@ -68,7 +68,7 @@ def dense(slopes: list[np.ndarray], r: np.ndarray, lower: list[float], upper: li
 
 @pytest.fixture(scope="module")
 def by_hand():
-    """Two directions of either sign in two shapes, one that is only positive, one with a threshold."""
+    """Three candidates: two amplitudes in two shapes, one non-negative amplitude, one with a threshold."""
     rng = np.random.default_rng(5)
     both = candidate("gravity", "hub", (((1.0, 0.0), (0.0, 1.0)), ((2.0, 0.0), (0.0, 2.0))))
     positive = candidate("coulomb", "hub", (((0.5,),),), one_sided=True)
@@ -79,14 +79,14 @@ def by_hand():
     slopes[(positive.location, 0)] = (shared + 0.1 * rng.normal(size=SAMPLES))[None]
     slopes[(step.location, 0)] = (shared + 0.1 * rng.normal(size=SAMPLES))[None]
     slopes[(both.location, 1)][0] *= 1e6  # columns of very different sizes
-    # Both amplitudes of one sign beside what is shared: each alone hides the other.
+    # Both derivatives have a common part, which cancels in this difference: each alone explains little.
     r = 3 * (slopes[(step.location, 0)] - slopes[(positive.location, 0)])[0] + 0.3 * rng.normal(size=SAMPLES)
     r += 0.4 * slopes[(both.location, 0)][1]
     return c, slopes, r, made(c, slopes, r)
 
 
 def test_a_shape_without_slope_does_not_hide_the_others():
-    """One shape of a friction has no slope here; the pair is worth what the other one gains."""
+    """If one of two shapes has a zero derivative, the pair has the gain of the other shape."""
     rng = np.random.default_rng(8)
     friction = candidate("coulomb", "hub", (((1.0,),), ((2.0,),)))
     step = candidate("dead_zone", "input", (((0.2,),),), threshold=True)
@@ -110,7 +110,7 @@ def test_the_joint_score_is_dense_least_squares(by_hand):
     g = pairs[frozenset({positive.location, step.location})]
     each = [slopes[(c.location, 0)] for c in (positive, step)]
     assert g.gain == pytest.approx(dense(each, r, [0.0, -inf], [inf, inf]), rel=1e-6)
-    # The size of what has a threshold is held; the other amplitude stays where it was.
+    # The amplitude of a candidate with a threshold is limited; the other amplitude is not recomputed.
     large = -each[0][0] - 3.0 * each[1][0]
     far = ScoreTest(test.listed, test.candidates, dataclasses.replace(test.projected, r=large))
     (held,) = far.pairs([positive.location, step.location])
@@ -130,7 +130,7 @@ def test_the_joint_score_is_dense_least_squares(by_hand):
             options.append(gain)
         p = pairs[frozenset({both.location, other.location})]
         assert p.gain == pytest.approx(max(options), rel=1e-6)
-        # Two amplitudes and the choice of a shape, beside one amplitude.
+        # The penalty counts three amplitudes and the choice of a shape.
         assert p.nats == pytest.approx(p.gain - half_log * (2 + 1 + 1), rel=1e-6)
 
 
@@ -149,7 +149,7 @@ def test_values_are_those_of_the_solution(by_hand):
 
 
 def test_what_hides_behind_another_has_synergy():
-    """Two nearly equal slopes whose difference is missing: alone each explains little, together all."""
+    """The residual is a difference of two nearly equal derivatives: only both together explain it."""
     rng = np.random.default_rng(6)
     a, b = candidate("viscous", "hub", (((1.0,),),)), candidate("viscous", "arm", (((1.0,),),))
     c = candidate("gravity", "arm", (((1.0,),),))
@@ -165,7 +165,7 @@ def test_what_hides_behind_another_has_synergy():
     ((x, y), *_) = promising_pairs(test, test)
     assert set(x.locations) == {a.location, b.location} and x.locations == y.locations
     assert x.synergy > 0.5 * x.gain and x.more > 0
-    # One that contains the other is one effect.
+    # An effect is not paired with its own special case.
     rich = candidate("stribeck", "hub", (((1.0,),),))
     simple = candidate("coulomb", "hub", (((1.0,),),))
     slopes = {(rich.location, 0): own[:1], (simple.location, 0): own[1:2]}
@@ -173,7 +173,7 @@ def test_what_hides_behind_another_has_synergy():
 
 
 def test_a_richer_effect_that_gains_nothing_is_not_paired():
-    """A friction that is the same both ways would only be refitted to the simpler law."""
+    """Asymmetric friction is paired only if its two levels differ; otherwise Coulomb friction is paired."""
     rng = np.random.default_rng(7)
     simple, other = candidate("coulomb", "hub", (((1.0,),),)), candidate("viscous", "arm", (((1.0,),),))
     rich = candidate("coulomb_asymmetric", "hub", (((1.0, 0.0), (0.0, 1.0)),))
@@ -204,7 +204,7 @@ def scored(location: EffectLocation, gain: float) -> Score:
 
 
 def test_the_best_candidates_of_both_horizons():
-    """Shares of the best of each horizon add up: one with large numbers does not decide alone."""
+    """Gains are added as shares of the best one, so that the horizon with larger gains does not dominate."""
     places = [EffectLocation("viscous", p) for p in "abcd"]
     tests = [
         ScoreTest([scored(p, g) for p, g in zip(places, gains, strict=True)], {}, None)
@@ -230,7 +230,7 @@ def usual(s: SuperModel, location: EffectLocation) -> np.ndarray:
 
 
 def grown(s: SuperModel, h: Hypothesis, location: EffectLocation, size: float) -> Hypothesis:
-    """A hypothesis with an effect of so many times its usual size; likelier on training data the larger."""
+    """A hypothesis with an effect of `size` times its usual size; training likelihood grows with `size`."""
     more = with_effect(s, h, CandidateStart(location, size * usual(s, location)), 1.0)
     return dataclasses.replace(more, densities=np.full((2, 1), size))
 
@@ -240,7 +240,7 @@ def validated(h: Hypothesis, gain: float, **more) -> ValidatedHypothesis:
 
 
 def alone(s, location, gains: tuple[float, float], sizes=(1.0, 1.0), h=None) -> ValidatedHypothesis:
-    """An effect beside a model, the baseline if None: gains on validation data and sizes at both horizons."""
+    """A model (None: the baseline) with one more effect, its validation gains and sizes at both horizons."""
     fits = [grown(s, h or sp.unfitted(s), location, x) for x in sizes]
     return validated(fits[0], gains[0], location=location, free_run=validated(fits[1], gains[1]))
 
@@ -255,7 +255,7 @@ def baseline_of(s: SuperModel) -> ValidatedHypothesis:
 
 
 def test_what_each_horizon_gained_most_by_is_refitted_together(s):
-    """From where the refits of each alone have ended, and from these models."""
+    """The effects with the largest gain at each horizon are paired, starting from their single refits."""
     known = [alone(s, VISCOUS, (20.0, 3.0)), alone(s, SPRING, (100.0, -5.0), (1.0, 2.0))]
     known += [alone(s, STRIBECK, (0.0, 29.0)), alone(s, DAHL, (-5.0, 30.0), (3.0, 4.0))]
     both = best_refitted(s, baseline_of(s), known)
@@ -265,13 +265,13 @@ def test_what_each_horizon_gained_most_by_is_refitted_together(s):
             np.testing.assert_allclose(start.values, sizes[place] * usual(s, start.location))
             assert set(h.locations) - set(s.calibrations) == {start.location}
             np.testing.assert_allclose(h.mean_values(s)[s.parameter_indices(start.location)], start.values)
-    # What predictions gain by another effect as well, free runs need not.
+    # Viscous friction, with nearly the largest gain in predictions, is not paired.
     known = [alone(s, SPRING, (1.0, 0.3)), alone(s, VISCOUS, (0.95, 0.2)), alone(s, DAHL, (0.0, 1.0))]
     assert placed(best_refitted(s, baseline_of(s), known)) == {SPRING, DAHL}
 
 
 def test_where_one_effect_leads_at_both_horizons_the_next_one_joins(s):
-    """Shares of both gains decide, and of two laws of the friction at the hub one counts."""
+    """The next effect has the next largest sum of gain shares, and is no other law of the same friction."""
     known = [alone(s, DAHL, (100.0, 30.0)), alone(s, SPRING, (20.0, 20.0)), alone(s, VISCOUS, (30.0, 3.0))]
     assert placed(best_refitted(s, baseline_of(s), known)) == {DAHL, SPRING}
     known = [alone(s, STRIBECK, (90.0, 29.0)), alone(s, DAHL, (-5.0, 30.0)), alone(s, VISCOUS, (20.0, 3.0))]
@@ -279,7 +279,7 @@ def test_where_one_effect_leads_at_both_horizons_the_next_one_joins(s):
 
 
 def test_of_two_fits_of_one_effect_the_likelier_counts(s):
-    """A candidate is refitted beside the model as it is and beside the values given, where these differ."""
+    """If an effect was refitted from two models, the fit with the larger training likelihood counts."""
     known = [alone(s, SPRING, (100.0, 1.0)), alone(s, VISCOUS, (0.0, 20.0)), alone(s, DAHL, (0.0, 30.0))]
     stuck = alone(s, DAHL, (0.0, -1.0), (0.5, 0.5))
     for tried in ([*known, stuck], [stuck, *known]):
@@ -287,7 +287,7 @@ def test_of_two_fits_of_one_effect_the_likelier_counts(s):
 
 
 def test_effects_of_another_model_are_no_pair(s):
-    """None that gained nothing, is in the model, was refitted beside another one, or at one horizon only."""
+    """Left out: effects that gained nothing, are in the model, were added to another, or lack free runs."""
     spring, dahl = alone(s, SPRING, (100.0, -5.0)), alone(s, DAHL, (-5.0, 30.0))
     for few in ([], [spring], [spring, alone(s, DAHL, (-1.0, 0.0))]):
         assert best_refitted(s, baseline_of(s), few) is None
@@ -301,7 +301,7 @@ def test_effects_of_another_model_are_no_pair(s):
 
 
 def test_a_pair_is_refitted_from_its_likeliest_start(s, monkeypatch: pytest.MonkeyPatch):
-    """Beside the model as it is, or an effect added to a model that has the other one."""
+    """Both effects are added to the current model, or one of them to a model that has the other one."""
     h = sp.unfitted(s)
     monkeypatch.setattr(pairs, "refit", lambda problem, starts: starts)
     moved = grown(s, h, DAHL, 3.0)
@@ -320,7 +320,7 @@ def test_a_pair_is_refitted_from_its_likeliest_start(s, monkeypatch: pytest.Monk
 
 
 def test_a_pair_of_the_best_effects_is_tried_once(s, monkeypatch: pytest.MonkeyPatch):
-    """After those of the scores, from where its effects were refitted; also where no score asks for any."""
+    """It is tried after the pairs from the score tests, and also if there are none of these."""
 
     def score(*locations: EffectLocation) -> PairScore:
         a, b = (CandidateStart(p, usual(s, p)) for p in locations)
@@ -338,24 +338,24 @@ def test_a_pair_of_the_best_effects_is_tried_once(s, monkeypatch: pytest.MonkeyP
         last = asked[-1][-1][0]
         assert [p.locations for p, _ in asked[-1][:-1]] == [other.locations] * bool(scored)
         assert last.locations == ((DAHL, SPRING) if len(scored) == 2 else (SPRING, DAHL))
-        for start in asked[-1][-1]:  # each model has the effect that is named at its place
+        for start in asked[-1][-1]:  # models are in the order of the locations
             for location, h in zip(start.locations, start.alone, strict=True):
                 assert set(h.locations) - set(s.calibrations) == {location}
-        assert isinstance(last, PairScore) == (len(scored) == 2)  # with the sizes of its score
+        assert isinstance(last, PairScore) == (len(scored) == 2)  # keeps the sizes from its score
     asked.clear()
     assert find_pair(*given) == (None, []) and not asked
 
 
 @pytest.fixture(scope="module")
 def small():
-    """Recordings with a little friction, the baseline at its optimum, and its test."""
+    """Recordings with little friction: likelihood, fitted baseline, and its score test."""
     problem = sp.problem(sp.recordings(sp.records(0.0015)))
     h = sp.fitted(problem)
     return problem, h, score_test(problem, h)
 
 
 def test_a_pair_of_a_model_is_dense_least_squares_too(small):
-    """Slopes of the super-model, less everything that the baseline can still move."""
+    """The same with derivatives of the super-model, less the part that the baseline can still explain."""
     problem, _, test = small
     places = [sp.HUB, EffectLocation("cubic_spring", "joint"), EffectLocation("coulomb", "joint")]
     for p in test.pairs(places):
@@ -386,7 +386,7 @@ STIFFENS, JOINT = EffectLocation("cubic_spring", "joint"), EffectLocation("coulo
 
 
 def horizons(hidden: dict) -> Horizons:
-    """Training and validation recordings of a machine with these effects, cut to free runs of 0.8 s."""
+    """Training and validation recordings of a machine with these effects, with free runs of 0.8 s."""
     made = [
         make_record(hidden, seed=seed, seconds=1.6, fs=400.0, perturb=0.0, rms=1.5)
         for seed in (31, 32, 33, 34)
@@ -403,7 +403,7 @@ def horizons(hidden: dict) -> Horizons:
 @pytest.mark.slow
 @pytest.mark.parametrize("spring", [60.0, 0.0])
 def test_a_pair_must_be_better_than_each_of_its_members(spring: float):
-    """Two hidden effects are found at once; where one is hidden, no pair is."""
+    """Two hidden effects are found as a pair; if only one is hidden, no pair is found."""
     hidden = {sp.HUB: {"level": 0.02}} | ({STIFFENS: {"coefficient": spring}} if spring else {})
     at = horizons(hidden)
     problem, runs = at.prediction.problem, at.free_run.problem
@@ -430,8 +430,8 @@ def test_a_pair_must_be_better_than_each_of_its_members(spring: float):
     again, more = find_pair(at, current, tests, lambda h, p: True, lines.append, tried)
     assert again and all(again.members[p] is less for p, less in found.members.items())
     assert len(more) == len(tried) - 2
-    # Where steps of one effect had ended with another pair, this one would be fitted and told; where they
-    # have ended with it, nothing is.
+    # If the search had ended with another pair, this one is fitted and reported. If it has ended with this
+    # one, nothing is fitted.
     pairs = promising_pairs(*tests)
     wrong = tuple(t.pairs([sp.HUB, JOINT])[0] for t in tests)
     (other,) = validated_pairs(at, current, [wrong], lambda h, p: True).values()
@@ -440,8 +440,8 @@ def test_a_pair_must_be_better_than_each_of_its_members(spring: float):
     fits, alike = pairs_passed_by(*given, other, lambda h, p: True, lines.append)
     assert [set(p) for p in alike] == [{sp.HUB, STIFFENS}] and len(fits) == 1
     assert all(v.free_run for v in fits)
-    # Predictions refuse the wrong one beyond doubt: it is told, but not fitted to free runs, and what is not
-    # fitted to both has no probability.
+    # Predictions are clearly worse with the wrong pair. It is named in the lines of progress, but not fitted
+    # to free runs, so it has no probability.
     lines.clear()
     given_wrong = at, current, [wrong], found.found, lambda h, p: True, lines.append
     assert pairs_passed_by(*given_wrong) == ([], []) and len(lines) == 2

@@ -1,4 +1,4 @@
-"""What every effect must satisfy, and what each one says."""
+"""Properties of every effect, and the law of each one against a closed form."""
 
 import ast
 import dataclasses
@@ -99,7 +99,7 @@ CONSERVATIVE = {
     "cogging",
     "joint_play",
 }
-# Where the typical values sit on a kink: a delay of whole samples of 2 ms has a slope on each side.
+# Typical values at a kink: a delay of whole samples of 2 ms has different derivatives on both sides.
 BESIDE_THE_KINK = {"delay": {"time": 0.0033}}
 
 every_effect = pytest.mark.parametrize("cls", CLASSES, ids=lambda c: c.name)
@@ -113,7 +113,7 @@ def _strict_double():
 
 
 def example(cls: type[Effect]) -> Effect:
-    """An instance with a different, unremarkable value for each parameter."""
+    """An instance with a different ordinary value for each parameter."""
     given = {}
     for i, (name, spec) in enumerate(cls.declared().items()):
         if getattr(cls, name) is not None:
@@ -122,11 +122,11 @@ def example(cls: type[Effect]) -> Effect:
 
 
 def law(effect: Effect, numbers, position, speed, voltage, z):
-    """All that an effect says at one point, as one vector, whatever its kind."""
+    """All outputs of an effect of any kind at one point, as one vector."""
     effect = effect.replace(**dict(zip(effect.values, numbers, strict=True)))
     if isinstance(effect, Linear):
         said = entries(effect)
-        if isinstance(effect, Force):  # what a limit takes away
+        if isinstance(effect, Force):  # torque that a limit removes
             said.append(effect.force(position, speed, voltage))
         elif isinstance(effect, Memory):
             signals = (z, position, speed, voltage)
@@ -141,7 +141,7 @@ def law(effect: Effect, numbers, position, speed, voltage, z):
             effect.force(z, position, speed, voltage),
             effect.flow(z, position, speed, voltage),
         ]
-    elif isinstance(effect, Gear):  # a rotor with no room to turn is no rotor
+    elif isinstance(effect, Gear):  # without play the rotor does not count
         said = [effect.stops(), effect.stops() * effect.rotor(), *(effect.teeth() or ())]
     elif isinstance(effect, Actuation):
         voltages = voltage * jnp.array([1.0, -1.0, 0.3], voltage.dtype)
@@ -161,12 +161,12 @@ def entries(effect: Linear | Sensing) -> list:
 
 
 def beside(effect: Sensing, other, z) -> tuple:
-    """What a sensor is given besides the true value; a speed where it has states of its own."""
+    """Further arguments of a sensor: another channel; or its states and the derivative, here a speed."""
     return {"nothing": (), "other": (other,), "states": ((z, 2 * z), 1)}[effect.beside]
 
 
 def nothing(effect: Effect, position, voltage):
-    """What `law` gives where the effect is absent."""
+    """The value of `law` without the effect."""
     if isinstance(effect, Actuation):
         return voltage * jnp.array([1.0, -1.0, 0.3])
     if isinstance(effect, Sensing):
@@ -200,14 +200,15 @@ def test_probes_are_valid_and_show(cls, scale):
                 assert np.isfinite(said).all()
                 shown.append(np.ravel(said - nothing(effect, x, v)))
             moved.append(np.concatenate(shown))
-        # Each probe does something, and each something else than the others of its group.
+        # Each probe has an effect, and the effects of a group are linearly independent.
         assert np.linalg.matrix_rank(np.array(moved), tol=1e-12) == len(group)
 
 
 @every_effect
 def test_ports_and_relations(cls):
     assert set(cls.searched) <= {*cls.ports, "loaded"}  # a role of the hub
-    assert set(cls.amplitudes) <= set(cls.declared())
+    assert {*cls.amplitudes, *cls.vanishes_with} <= set(cls.declared())
+    assert not set(cls.amplitudes) & set(cls.vanishes_with)
     assert set(cls.contains) <= set(CATALOG)
     # A special case is a law of the same thing.
     assert all(cls.law_of and CATALOG[name].law_of == cls.law_of for name in cls.contains)
@@ -287,7 +288,7 @@ def test_jit_vmap_and_arrays_agree_with_one_point(cls):
     "cls", [c for c in CLASSES if not issubclass(c, (Actuation, Sensing, Gear))], ids=lambda c: c.name
 )
 def test_gives_no_energy(cls):
-    """A torque takes energy at every moment but for what it stores, or is a function of the position."""
+    """A torque takes at least the energy that it stores, or is a function of the position alone."""
     if cls.name == "viscous_asymmetric":
         pytest.skip("a share of the damping beside it: passive together with it, not alone")
     if cls.acts_on == "signal":
@@ -324,7 +325,7 @@ def test_gives_no_energy(cls):
 
 
 def taken(effect: Effect, x: float, w: float, v: float, z: float) -> float:
-    """Power [W] that an effect with a state takes from its port and does not store."""
+    """Power [W] that an effect takes from its port and does not store."""
     if isinstance(effect, SecondMode):  # `x` is the angle of the part from the port, `v` its own speed
         s, W = effect.stamp(), 2 * math.pi * effect.frequency
         turn, accelerate = (a * x + b * v + c * w for (a, b), c in zip(s.own, s.from_speed, strict=True))
@@ -336,7 +337,7 @@ def taken(effect: Effect, x: float, w: float, v: float, z: float) -> float:
     if isinstance(effect, Heating):  # `v` is the torque of the cold motor; what is lost is part of it
         loss = float(effect.force(*scalars(abs(z), x, w, v)))
         assert abs(loss) < abs(v)
-        assert float(effect.flow(*scalars(0.0, x, w, v))) >= 0  # never colder than cold
+        assert float(effect.flow(*scalars(0.0, x, w, v))) >= 0  # the temperature never falls below the start
         return -loss * v
     if isinstance(effect, TorqueSaturation):  # `v` is the torque of the linear motor
         loss = float(effect.force(*scalars(x, w, v)))
@@ -346,7 +347,7 @@ def taken(effect: Effect, x: float, w: float, v: float, z: float) -> float:
         z = (1 + effect.rise) * np.tanh(z)
         w = math.copysign(min(abs(w), 4 * effect.level / effect.damping), w)
         lever = effect.level * effect.presliding * z
-    else:  # what comes back on the way to no torque at all
+    else:  # the energy that is returned on the way to zero torque
         assert isinstance(effect, BoucWen)
         z = np.tanh(z)
         lever = effect.level * effect.width * z / (1 - (1 - 2 * effect.beta) * abs(z))
@@ -411,7 +412,7 @@ def test_bad_parameters_are_named(cls):
 
 
 def test_what_may_be_negative():
-    """Only what has a sign by nature, and damping, which is what the motor's own leaves over."""
+    """Only signed quantities, and viscous damping, which is relative to the damping of the motor."""
     negative = {f"{c.name}.{n}" for c in CLASSES for n, s in c.declared().items() if s.lower < 0}
     assert negative == {
         "viscous.coefficient",
@@ -499,7 +500,7 @@ def test_a_users_own_effect_enters_the_catalogue_and_the_search():
     try:
         assert register(Cog) is Cog
         assert (Cog, "arm") in search_places(paper())
-        register(Cog)  # a cell that is run twice
+        register(Cog)  # as in a notebook cell that is run twice
     finally:
         del CATALOG["cog_of_a_user"]
 
@@ -518,7 +519,7 @@ def test_candidates_cover_the_first_family():
     assert {("sensor_cubic", "alpha"), ("rectifier", "alpha"), ("cross_talk", "alpha")} <= pairs
     assert {("eccentric_encoder", "theta"), ("channel_delay", "theta"), ("channel_delay", "alpha")} <= pairs
     assert {("voltage_drift", "input"), ("periodic_disturbance", "input")} <= pairs
-    # What ties with a simpler effect on most recordings is tried on request only.
+    # Effects that are equivalent to a simpler one on most recordings are tried on request only.
     assert not {"load_friction", "amplifier_saturation", "elastic_backlash"} & {n for n, _ in pairs}
     assert not {"gear_friction", "torque_saturation"} & {n for n, _ in pairs}  # no weight at the hub
     assert ("heating", "arm") not in pairs and ("heating", "joint") not in pairs  # no motor there
@@ -526,7 +527,7 @@ def test_candidates_cover_the_first_family():
     assert not {"inertia", "spring", "motor"} & {n for n, _ in pairs}
 
 
-# -- what each one says -------------------------------------------------------------------------
+# -- the law of each one ------------------------------------------------------------------------
 
 
 def test_linear_stamps():
@@ -604,17 +605,17 @@ def test_actuation_laws_and_their_order():
 
 
 def like_on_a_mass(mean, moment):
-    """Voltages to hold that move a mass at rest as the true ones do, from their means and first moments.
+    """Held voltages that move a mass like the true ones, from their means and first moments.
 
-    The moment of a sample is `int (t - middle) v dt / Ts^2`: it moves the mass back by as much, which a
-    pulse in this sample and its opposite in the next do as well.
+    The moment of a sample is `int (t - middle) v dt / Ts^2`: it moves the mass back in proportion. A pulse in
+    this sample and its opposite in the next one have the same effect.
     """
     return mean - np.diff(moment, prepend=0.0)
 
 
 @pytest.mark.parametrize("samples", [0, 1, 3, 0.25, 1.5, 2.999, 40, 41.3])
 def test_delay_moves_a_mass_like_the_shifted_staircase(samples):
-    """The staircase on a grid a thousand times as fine, on which its steps lie exactly."""
+    """Reference: the shifted staircase on a grid 1000 times as fine, on which its steps lie exactly."""
     rng, Ts, N, fine = np.random.default_rng(0), 0.004, 30, 1000
     u = rng.normal(size=N)
     late = np.asarray(Delay(time=samples * Ts).drive(jnp.asarray(u), Ts))
@@ -630,7 +631,7 @@ def test_delay_moves_a_mass_like_the_shifted_staircase(samples):
 
 @pytest.mark.parametrize("time", [3e-4, 0.006, 0.5])
 def test_lag_moves_a_mass_like_a_low_pass(time):
-    """Against scipy's simulation on a grid a hundred times as fine, Simpson's rule over each sample."""
+    """Reference: scipy's `lsim` on a grid 100 times as fine, with Simpson's rule over each sample."""
     rng, Ts, N, fine = np.random.default_rng(0), 0.004, 30, 100
     u = rng.normal(size=N)
     t = np.arange(N * fine + 1) * Ts / fine
@@ -646,7 +647,7 @@ def test_lag_moves_a_mass_like_a_low_pass(time):
 
 
 def test_a_short_lag_is_a_short_delay():
-    """Both shift the centre of a slow signal by the same time."""
+    """Both delay a ramp by the same time."""
     Ts = 0.004
     ramp = jnp.arange(400.0) * Ts
     late, slow = (e.drive(ramp, Ts) for e in (Delay(time=0.0101), Lag(time=0.0101)))
@@ -660,7 +661,7 @@ def test_cogging_repeats_and_keeps_energy():
     said = np.asarray(torque.force(x, x, x))
     np.testing.assert_allclose(torque.force(x + 2 * np.pi / 7, x, x), said, rtol=0, atol=1e-15)
     np.testing.assert_allclose(torque.force(x + np.pi / 7, x, x), -said, rtol=0, atol=1e-15)
-    # Its potential: what a spring of that kind stores, here and there.
+    # The work is the difference of a potential in closed form.
     stored = (-0.02 * np.cos(7 * x) - 0.013 * np.sin(7 * x)) / 7
     work = scipy.integrate.simpson(said, x=x)
     np.testing.assert_allclose(work, stored[0] - stored[-1], rtol=1e-6)
@@ -694,7 +695,7 @@ def test_sensing_laws():
 
 
 def test_dahl_builds_up_over_the_presliding():
-    """Under a steady motion z = 1 - exp(-x / presliding)."""
+    """In a steady motion z = 1 - exp(-x / presliding): a closed form."""
     friction = Dahl("hub", level=0.03, presliding=0.004)
     x = jnp.linspace(0.0, 0.03, 50)
     z = 1 - jnp.exp(-x / 0.004)

@@ -234,17 +234,17 @@ def replacing(
     c, own = s.candidates[start.location], start.values.copy()
     for k, i in enumerate(c.parameters):
         if name[i] in known:
-            # Parameters of the simpler effect keep their size; only other amplitudes get the share.
-            own[k] = known[name[i]] / (share if c.amplitudes[k] else 1.0)
+            # Parameters of the simpler effect keep their size; only other parameters get the share.
+            own[k] = known[name[i]] / (share if c.shrinking[k] else 1.0)
     return with_effect(s, h, dataclasses.replace(start, values=own), share)
 
 
 def with_effect(s: SuperModel, h: Hypothesis, start: CandidateStart, share: float) -> Hypothesis:
-    """The hypothesis with one more effect, at a share of the amplitudes of its start."""
+    """The hypothesis with one more effect, at a share of the size of its start."""
     c = s.candidates[start.location]
     specs = [s.mechanism.parameter_specifications[i] for i in c.parameters]
     size = np.abs(np.array(c.probes[0])).max(axis=0)
-    values = np.where(c.amplitudes, share * start.values, start.values)
+    values = np.where(c.shrinking, share * start.values, start.values)
     for k, spec in enumerate(specs):
         # A lower bound is at minus infinity of the unconstrained coordinate: the start is a little above it.
         if np.isfinite(spec.lower) and k != c.line:

@@ -21,6 +21,7 @@ from rotflex_jax.discover.hypothesis import (
     without,
 )
 from rotflex_jax.discover.likelihood import (
+    MIN_DECREASE_NATS,
     LikelihoodProblem,
     choose_process_noise,
     levenberg_marquardt,
@@ -130,6 +131,9 @@ SHAPE_CHOICE_STEPS = 6
 AMPLITUDE_SHARES = (1.0, 0.4, 0.1, 0.02)
 # A refit that gains less than this share of the gain that the score test expects has missed the optimum.
 STUCK_SHARE = 0.5
+# A model with one more effect is no worse at its optimum. A refit of a candidate with a promising score that
+# ends worse starts again from this share of the amplitude, where the effect does nearly nothing.
+LEAST_SHARE = 1e-3
 
 
 def refit_candidates(
@@ -140,8 +144,8 @@ def refit_candidates(
     The amplitude that the score test suggests is too large where an effect is strongly nonlinear. So a refit
     starts at the likeliest of several shares of this amplitude, and at the shape with which a few steps gain
     most. If a refit gains far less than the score test expects, it starts again from a small amplitude of
-    every shape. An effect with memory replaces the simpler effect that it contains, since the two in parallel
-    would be a third effect.
+    every shape; if it is still worse than the current model, from a very small one. An effect with memory
+    replaces the simpler effect that it contains, since the two in parallel would be a third effect.
     """
     s = problem.supermodel
     for c in starts:
@@ -171,11 +175,14 @@ def _refit_candidate(problem: LikelihoodProblem, current: Hypothesis, start: Can
     if len(likeliest) > 1:
         likeliest = levenberg_marquardt(problem, likeliest, max_steps=SHAPE_CHOICE_STEPS)
     (refitted,) = refit(problem, [max(likeliest, key=lambda h: h.log_likelihood)])
-    gain = refitted.log_likelihood - current.log_likelihood
-    if gain >= STUCK_SHARE * max(start.expected_gain, 0.0):
+    if refitted.log_likelihood - current.log_likelihood >= STUCK_SHARE * max(start.expected_gain, 0.0):
         return refitted
     again = refit(problem, [row[-1] for row in grown])
-    return max([refitted, *again], key=lambda h: h.log_likelihood)
+    refitted = max([refitted, *again], key=lambda h: h.log_likelihood)
+    if start.expected_gain <= 0 or refitted.log_likelihood > current.log_likelihood - MIN_DECREASE_NATS:
+        return refitted
+    nearly = [with_candidate(problem.supermodel, current, shape, LEAST_SHARE) for shape in shapes]
+    return max([refitted, *refit(problem, nearly)], key=lambda h: h.log_likelihood)
 
 
 def refit_from(

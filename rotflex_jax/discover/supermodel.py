@@ -130,6 +130,7 @@ class Candidate:
         probes: Alternatives (shapes), each a list of parameter vectors that are tried together, one direction
             of the score test per vector.
         amplitudes: For each parameter, whether it is an amplitude.
+        shrinking: For each parameter, whether the effect vanishes with it; true for each amplitude.
         one_sided: Whether negative amplitudes are not physical.
         threshold: Whether a small amplitude does nothing at all, so that only runs at full size show what the
             effect does.
@@ -144,6 +145,7 @@ class Candidate:
     parameters: tuple[int, ...]
     probes: tuple[tuple[tuple[float, ...], ...], ...]
     amplitudes: tuple[bool, ...]
+    shrinking: tuple[bool, ...]
     one_sided: bool
     threshold: bool = False
     line: int | None = None
@@ -397,6 +399,7 @@ def build(
             tuple(range(last - len(names), last)),
             probes,
             tuple(n in cls.amplitudes for n in names),
+            tuple(n in (*cls.amplitudes, *cls.vanishes_with) for n in names),
             all(max(s.lower, s.physical[0]) >= 0 for n, s in cls.declared().items() if n in cls.amplitudes),
             threshold=not cls.slope_at_zero,
             line=names.index(cls.line) if cls.line else None,

@@ -309,6 +309,7 @@ class Delay(Actuation):
     name: ClassVar[str] = "delay"
     title: ClassVar[str] = "input delay"
     law_of: ClassVar[str] = "late input"
+    vanishes_with: ClassVar[tuple[str, ...]] = ("time",)
     equation: ClassVar[str] = "v(t) = u(t - time)"
     searched: ClassVar[tuple[str, ...]] = ("input",)
     stage: ClassVar[int] = 3
@@ -365,6 +366,7 @@ class Lag(Actuation):
     name: ClassVar[str] = "lag"
     title: ClassVar[str] = "input lag"
     law_of: ClassVar[str] = "late input"
+    vanishes_with: ClassVar[tuple[str, ...]] = ("time",)
     equation: ClassVar[str] = "time * dv/dt = u - v"
     searched: ClassVar[tuple[str, ...]] = ("input",)
     stage: ClassVar[int] = 4

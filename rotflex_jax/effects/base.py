@@ -159,6 +159,9 @@ class Effect(abc.ABC):
     ports: ClassVar[tuple[str, ...]] = ("hub", "arm", "joint")
     # Parameters that are amplitudes: the effect is inactive if all of them are zero.
     amplitudes: ClassVar[tuple[str, ...]] = ()
+    # Further parameters with which the effect vanishes, although it has no derivative where they are zero,
+    # such as the time of a delay. Refits also start from small shares of them.
+    vanishes_with: ClassVar[tuple[str, ...]] = ()
     # Simpler effects that this one contains at special values of its parameters.
     contains: ClassVar[tuple[str, ...]] = ()
     # Phenomenon that several laws describe, such as dry friction. Only a model with errors near the noise can

@@ -346,6 +346,7 @@ class ChannelDelay(Sensing):
     name: ClassVar[str] = "channel_delay"
     title: ClassVar[str] = "sensor delay"
     equation: ClassVar[str] = "y(t) = value(t - time)"
+    vanishes_with: ClassVar[tuple[str, ...]] = ("time",)
     ports: ClassVar[tuple[str, ...]] = ("theta", "alpha")
     searched: ClassVar[tuple[str, ...]] = ("theta", "alpha")
     relative: ClassVar[bool] = True
