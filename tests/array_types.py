@@ -1,6 +1,6 @@
-"""A type checker for the import hook of jaxtyping: shapes and types of arrays, as annotations state them.
+"""A type checker for the import hook of jaxtyping that checks only annotated arrays.
 
-Other annotations are not checked: a parameter of an effect is a `float` that JAX may trace.
+Other annotations are not checked, since JAX may trace a parameter that is annotated as `float`.
 """
 
 import dataclasses
@@ -13,11 +13,11 @@ from typing import Any, get_args
 import jaxtyping
 from beartype import BeartypeConf, beartype
 
-CONFIGURATION = BeartypeConf(is_pep484_tower=True)  # a whole number is a float, as in annotations
+CONFIGURATION = BeartypeConf(is_pep484_tower=True)  # an int is accepted where a float is annotated
 
 
 def holds_array(hint: Any) -> bool:
-    """Whether an annotation states the shape of an array somewhere."""
+    """Whether an annotation contains a jaxtyping array."""
     own = inspect.isclass(hint) and issubclass(hint, jaxtyping.AbstractArray)
     return own or any(holds_array(part) for part in get_args(hint))
 
@@ -29,17 +29,17 @@ def checked(function: Callable[..., Any]) -> Callable[..., Any]:
     return beartype(conf=CONFIGURATION)(function) if hints else function
 
 
-# So many calls of each function are checked in a process. Shapes differ between tests, not between the
-# thousands of calls that one search makes.
+# Number of calls of each function that are checked in a process. Shapes differ between tests, not between
+# the thousands of calls in one search.
 CALLS = 50
 _always = jaxtyping.jaxtyped
 
 
 @functools.wraps(_always)
 def _at_first(*given: Any, **options: Any) -> Any:
-    """The decorator of the hook, for functions that have arrays, and for their first calls.
+    """Replacement of `jaxtyping.jaxtyped` that checks only functions with arrays, and only their first calls.
 
-    The hook wraps every function of the package, and a call of one takes about 0.1 ms more then.
+    The hook wraps every function of the package, and each checked call takes about 0.1 ms longer.
     """
     if not given:
         return functools.partial(_at_first, **options)

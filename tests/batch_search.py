@@ -1,4 +1,4 @@
-"""Searches that take no time, for the machinery around them; worker processes import this file."""
+"""Instant replacements of a search, for tests of batches; worker processes import this file."""
 
 import os
 import signal
@@ -14,7 +14,7 @@ from rotflex_jax.recording import Recording
 
 
 def quick(model: Model, train: Recording, test: Recording, hold: str = "") -> Any:
-    """A result made of plain sums over the recording, in the form of a discovery."""
+    """A result computed from means over the recordings, in the format of a discovery."""
     channels = model.mechanism.channels
     rms = np.sqrt(np.mean(test.y**2, axis=0)).tolist()
     errors = {
@@ -31,7 +31,7 @@ def quick(model: Model, train: Recording, test: Recording, hold: str = "") -> An
 
 
 def dying_once(model: Model, train: Recording, test: Recording, folder: str = "") -> Any:
-    """Ends its process at its first try of each loud recording, and always at the loudest."""
+    """Kills its process at the first attempt at a mean absolute voltage above 1 V, and always above 3 V."""
     level = float(np.mean(np.abs(train.u)))
     mark = Path(folder) / f"{level:.9g}"
     if level > 1 and (level > 3 or not mark.exists()):
@@ -41,7 +41,7 @@ def dying_once(model: Model, train: Recording, test: Recording, folder: str = ""
 
 
 def waiting(model: Model, train: Recording, test: Recording, folder: str = "") -> Any:
-    """Says that it is running, and goes on when the file `go` is there."""
+    """Adds the id of its process to the file `running`, then waits for the file `go`."""
     import time
 
     with (Path(folder) / "running").open("a") as file:
@@ -52,7 +52,7 @@ def waiting(model: Model, train: Recording, test: Recording, folder: str = "") -
 
 
 def faulty(model: Model, train: Recording, test: Recording) -> Any:
-    """Fails on loud recordings, in two ways."""
+    """Raises an InputError if the mean absolute voltage exceeds 1 V, and a ZeroDivisionError above 3 V."""
     level = float(np.mean(np.abs(train.u)))
     if level > 3:
         raise ZeroDivisionError("a fault\nof the program")

@@ -1,4 +1,4 @@
-"""A strict JAX session, types checked at run time, and the measured recordings where they are available."""
+"""Settings of the test session: strict JAX, types checked at run time, measured recordings if available."""
 
 import contextlib
 import gc
@@ -20,7 +20,7 @@ from rotflex_jax.runtime.xla import enable_compilation_cache
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
-# What one test has compiled serves the others, those of a process beside it, and the next run.
+# Compiled programs are shared by all tests, by parallel processes and by later runs.
 enable_compilation_cache(Path(__file__).resolve().parents[1] / ".pytest_cache" / "compiled")
 
 BESIDE = Path(__file__).resolve().parents[2] / "shared" / "data"
@@ -29,14 +29,14 @@ if BESIDE.is_dir():
 
 
 def pytest_collection_finish() -> None:
-    """What is there before the first test stays, so that no search of garbage need go through it."""
+    """Exclude objects that exist before the first test from garbage collection, which saves time."""
     gc.collect()
     gc.freeze()
 
 
 @pytest.fixture(autouse=True, scope="module")
 def memory_maps() -> Iterator[None]:
-    """A process that runs all tests would hold more compiled code than the system allows."""
+    """Release compiled programs before a module if the process is near the system's limit of memory maps."""
     clear_compilation_caches()
     yield
 
@@ -60,7 +60,7 @@ _raises = pytest.raises
 
 @contextlib.contextmanager
 def _raises_unchecked(*arguments: Any, **options: Any) -> Iterator[Any]:
-    """`pytest.raises`, without the check of types where the package itself refuses wrong arguments."""
+    """`pytest.raises`, without the check of types where an InputError of the package is expected."""
     refused = arguments[:1] == (InputError,)
     try:
         jaxtyping.config.update("jaxtyping_disable", refused)

@@ -1,4 +1,4 @@
-"""Fits on two devices, as a program: prints what one device found, what two did, and how many worked."""
+"""A program that fits on one and on two devices and prints both results and the numbers of devices used."""
 
 import json
 from collections.abc import Sequence
@@ -16,7 +16,7 @@ DOGLEG = optimistix.Dogleg(rtol=1e-9, atol=1e-9)
 
 
 def recorded() -> list[rf.Recording]:
-    """Three recordings; two devices divide neither these nor the five starts below."""
+    """Three recordings; neither their number nor that of the five starts below is divisible by two."""
     rng = np.random.default_rng(3)
     truth = rf.joints.paper(stiffness=1.3, hub_damping=0.007)
     recordings = []
@@ -28,7 +28,7 @@ def recorded() -> list[rf.Recording]:
 
 
 def fitted(recordings: list[rf.Recording], devices: Sequence[Any] | None) -> dict[str, Any]:
-    """What fits find: joint, from many starts, in windows with a number of each recording's own."""
+    """Results of a fit, of fits from many starts, and of a fit in windows with a local parameter."""
     joint = rf.joints.paper()
     fit = rf.fit(joint, recordings, devices=devices)
     many = rf.many_starts(joint, recordings, starts=5, short_seconds=None, devices=devices)
@@ -49,12 +49,12 @@ def fitted(recordings: list[rf.Recording], devices: Sequence[Any] | None) -> dic
 
 
 def alone(rows: jax.Array) -> jax.Array:
-    """Of four rows, two devices have two each: neither waits for the other."""
+    """A loop over each row. Two devices have two of four rows each, and neither should wait for the other."""
     return jax.lax.map(lambda n: jax.lax.while_loop(lambda k: k < n, lambda k: k + 1, 0), rows)
 
 
 def main() -> None:
-    """Both, and what the compiler makes of rows that are shared out evenly."""
+    """Fit on one and on two devices, and list the collective operations in the program of `alone`."""
     jax.config.update("jax_num_cpu_devices", 2)
     at_work: list[int] = []
 

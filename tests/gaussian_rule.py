@@ -1,4 +1,4 @@
-"""Gaussian averages of polynomials by a rule of nodes, for moments that need not trust any pairing."""
+"""Gaussian moments of polynomials by Gauss-Hermite quadrature, a reference for formulas by pairings."""
 
 import itertools
 
@@ -14,6 +14,6 @@ def gauss_hermite(R: np.ndarray, per_entry: int) -> tuple[np.ndarray, np.ndarray
 
 
 def monomials(z: np.ndarray) -> np.ndarray:
-    """1, z_i, z_i z_j for i <= j, written out."""
+    """Columns 1, z_i and z_i z_j for i <= j."""
     i, j = np.triu_indices(z.shape[1])
     return np.hstack([np.ones((len(z), 1)), z, z[:, i] * z[:, j]])

@@ -1,4 +1,4 @@
-"""Tries the installed package from outside of the tree, in an environment with nothing but its dependencies.
+"""Test of the installed package outside the source tree, in an environment with only its dependencies.
 
 `cd somewhere/else && python -I installed.py` needs no test library, and ends with an AssertionError if
 something is missing.
@@ -45,7 +45,7 @@ def main() -> None:
     missing = [name for name in DATA if not files("rotflex_jax").joinpath(name).is_file()]
     assert not missing, missing
 
-    # The same program by its command, where there is one, and by the name of the package.
+    # The command line, by `python -m` and, where it is installed, by its command.
     module = [sys.executable, "-I", "-m", "rotflex_jax"]
     assert said(*module, "--version") == rf.__version__
     program = Path(sys.executable).with_name("rotflex")
@@ -55,7 +55,7 @@ def main() -> None:
         manual = Path(sys.prefix, "share", "man", "man1", "rotflex.1")
         assert "discover" in manual.read_text(encoding="utf-8")
 
-    # A tiny identification: the record of a joint with another spring, which a fit finds again.
+    # A fit must recover the stiffness from a simulated recording of a joint with another spring.
     joint = rf.joints.paper()
     spring = "joint.spring.stiffness"
     at = joint.parameter_names.index(spring)

@@ -1,4 +1,4 @@
-"""The paper's joint without friction, from its listed matrices: what a linear bank is measured against."""
+"""The paper's joint without friction, from its published matrices: reference for linear filter banks."""
 
 import json
 from pathlib import Path
@@ -11,7 +11,7 @@ POLES = tuple(complex(*pole) for pole in PAPER["eig4"][:3])  # the fourth is the
 
 
 def impulse_response(Ts: float, seconds: float = 2.0) -> np.ndarray:
-    """Deflection [rad] at every sample after 1 V over one sample, in numpy."""
+    """Deflection [rad] at every sample after 1 V over one sample, by the matrix exponential."""
     big = np.zeros((5, 5))
     big[:4, :4], big[:4, 4] = PAPER["A4"], PAPER["B4"]
     big = expm(big * Ts)

@@ -26,7 +26,7 @@ NOISE = np.array([5.4e-4, 5.4e-4])
 
 @functools.cache
 def records(level: float = 0.0, seeds: tuple[int, ...] = (21, 22)) -> tuple[dict, ...]:
-    """The same machine twice, with friction of that level at the hub and offsets of +-20 mV."""
+    """Recordings of one machine with Coulomb friction of `level` at the hub, offsets of +20 and -20 mV."""
     return tuple(
         make_record(
             {HUB: {"level": level}, ("voltage_offset", "input"): {"offset": 0.02 * (-1) ** k}},
@@ -45,14 +45,14 @@ def recordings(made: tuple[dict, ...]) -> tuple[Recording, ...]:
 
 
 def baseline() -> Mechanism:
-    """The true joint, whose damping at the hub is left to the back-EMF, which a fit may move."""
+    """The true joint without viscous damping at the hub, which the free back-EMF has to replace."""
     joint = paper(joint_damping=0.003, hub_damping=0.004).without("viscous", "hub")
     return joint.release("hub.motor.back_emf")
 
 
 @functools.cache
 def supermodel() -> SuperModel:
-    """The same for all tests, so that it is compiled once."""
+    """One super-model for all tests, so that it is compiled once."""
     found = recordings(records())
     return build(baseline(), WANTED, scales(Model(baseline()), found, dataset(found).torque_scale))
 
@@ -66,7 +66,7 @@ def problem(found: tuple[Recording, ...]) -> LikelihoodProblem:
 
 
 def unfitted(s: SuperModel, count: int = 2) -> Hypothesis:
-    """The baseline of a super-model as it is, at rest, with nothing to fit and nothing compiled."""
+    """The baseline of a super-model at rest, without free parameters; needs no compilation."""
     return Hypothesis(
         locations=s.calibrations,
         free=(),
@@ -81,13 +81,13 @@ def unfitted(s: SuperModel, count: int = 2) -> Hypothesis:
 
 
 def start(at: LikelihoodProblem, wrong: float = 0.0, locations=None) -> Hypothesis:
-    """The baseline in a free run from rest, its free numbers wrong by a share."""
+    """The baseline in a free run from rest, its free parameters wrong by the relative error `wrong`."""
     s = supermodel()
     locations = s.calibrations if locations is None else locations
     R = len(at.seen)
     z = Transform.of(s.mechanism.parameter_specifications).unconstrain(s.mechanism.values)
     z[s.local] = 0.0
-    # Friction that nobody left out: what the back-EMF has to make up for.
+    # The back-EMF that replaces the viscous damping at the hub, which the baseline lacks.
     z[s.mechanism.parameter_names.index("hub.motor.back_emf")] = np.log(0.00767 * 1.04)
     z[s.baseline_free] += np.log1p(wrong)
     h = Hypothesis(
@@ -105,6 +105,6 @@ def start(at: LikelihoodProblem, wrong: float = 0.0, locations=None) -> Hypothes
 
 
 def fitted(at: LikelihoodProblem) -> Hypothesis:
-    """The baseline at its optimum, whitener and all."""
+    """The baseline at its optimum, with a fitted whitener."""
     h = levenberg_marquardt(at, [start(at)])[0]
     return levenberg_marquardt(at, [h])[0]

@@ -1,4 +1,4 @@
-"""A spindle of which only the speed is measured, and its recordings by a simulator of its own."""
+"""A spindle with a sensor of speed only, and recordings of it by an independent simulator."""
 
 import numpy as np
 
@@ -21,7 +21,7 @@ PAIRS = [(CATALOG[name], "shaft") for name in ("coulomb", "quadratic_drag")]
 
 
 def spun(N: int = 1500, seed: int = 1, inner: int = 10) -> rf.Recording:
-    """An inertia of 0.02 kg m^2 with friction that sticks, its speed alone; `inner` Euler steps a sample."""
+    """Speed of an inertia of 0.02 kg m^2 with friction that sticks, by `inner` Euler steps per sample."""
     rng, Ts, level = np.random.default_rng(seed), 0.004, 0.03
     waves = zip([2.5, 2.0, 1.5, 1.0], [0.23, 0.61, 1.37, 2.9], rng.uniform(0, 6, 4), strict=True)
     u = sum(a * np.sin(2 * np.pi * f * Ts * np.arange(N) + p) for a, f, p in waves)

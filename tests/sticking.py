@@ -1,8 +1,8 @@
-"""An integration with true sticking that shares nothing with the package: event-driven, by scipy.
+"""Event-driven integration of dry friction with sticking, by scipy and independent of the package.
 
-Between events every contact slides one way or rests, and an adaptive rule of order 8 integrates to
-a tolerance of 1e-11; events are a sliding speed that reaches zero and a holding torque that reaches
-its level. Exact, so that it can check the step of the package.
+Between events every contact slides in one direction or rests, and an adaptive method of order 8 integrates
+with a relative tolerance of 1e-11. An event is a sliding speed that reaches zero or a holding torque that
+reaches its level. The result is accurate enough to check the integration step of the package.
 """
 
 import dataclasses
@@ -12,14 +12,14 @@ from collections.abc import Callable
 import numpy as np
 from scipy.integrate import solve_ivp
 
-# A speed below this is rest [rad/s].
+# A speed below this counts as zero [rad/s].
 REST = 1e-14
 HUB, JOINT, ARM = (1.0, 0.0), (0.0, 1.0), (1.0, 1.0)
 
 
 @dataclasses.dataclass(frozen=True)
 class Contact:
-    """Dry friction at a port: `against(way, speed)` is the level against motion that way."""
+    """Dry friction at a port: `against(way, speed)` is the level against motion in a direction (+1, -1)."""
 
     port: tuple[float, float]
     against: Callable[[float, float], float]
@@ -70,12 +70,12 @@ class Joint:
         if rest:
             moving = free + ports.T @ np.where(np.array(modes) == 0, 0.0, f)
             P = ports[rest]
-            # Three contacts on two coordinates: the one of least norm of all holding torques.
+            # With three contacts on two coordinates, holding torques are not unique: use the least norm.
             f[rest] = np.linalg.lstsq(P @ inverse @ P.T, -P @ inverse @ moving, rcond=None)[0]
         return inverse @ (free + ports.T @ f), f
 
     def modes(self, x, v, letting_go):
-        """The consistent combination, the one that rests most where there are several.
+        """The consistent combination of modes; of several, the one with the most contacts at rest.
 
         Args:
             x: State.
@@ -100,7 +100,7 @@ class Joint:
         raise AssertionError(f"no consistent contact state at {x}")
 
     def hold(self, x, v, span):
-        """State after `span` [s] of a held voltage `v`."""
+        """State after `span` [s] of constant voltage `v`."""
         t, letting_go = 0.0, {}
         for _ in range(100):
             modes = self.modes(x, v, letting_go)

@@ -1,6 +1,6 @@
-"""A sweep over several devices: `sweep_on_devices.py [PROCESS PORT]` prints what it found as JSON.
+"""A sweep over several devices: `sweep_on_devices.py [PROCESS PORT]` prints its results as JSON.
 
-Alone it has eight virtual devices; as one of two processes it has two, and shares all four.
+Alone it has eight virtual devices. As one of two processes it has two, and the sweep uses all four.
 """
 
 import json
@@ -17,7 +17,7 @@ from rotflex_jax.basis import Delays, Volterra
 from rotflex_jax.recording import Recording
 from rotflex_jax.runtime.xla import mesh_of, spread
 
-# Neither two, four nor eight devices divide it.
+# Number of settings; it is divisible neither by two, nor by four, nor by eight.
 ROWS = 11
 
 
@@ -38,14 +38,14 @@ def sweep(devices: list, factor: float = 1.0) -> list[float]:
 
 
 def where(devices: list) -> list[int]:
-    """The device that had each row."""
+    """Index of the device that computes each row."""
     mesh = mesh_of(devices)
     run = jax.jit(spread(lambda rows: jnp.full(len(rows), jax.lax.axis_index("rows")), mesh))
     return np.asarray(run(np.zeros((ROWS, 2)))).tolist()
 
 
 def main() -> None:
-    """The sweep on one device, and on all that there are."""
+    """Run the sweep on one device and on several, and print the results."""
     alone = len(sys.argv) == 1
     jax.config.update("jax_num_cpu_devices", 8 if alone else 2)
     if not alone:

@@ -75,8 +75,8 @@ def test_complex_lms_identifies_complex_weights() -> None:
 
 
 def test_full_kernel_lms_is_triangular_lms_with_twice_the_step_off_the_diagonal() -> None:
-    # A full square of products counts every mixed one twice, so in the triangular layout the two
-    # equal weights of the square move as one of twice the size.
+    # The full layout contains every mixed product twice. Its two equal weights are one weight of twice
+    # the value in the triangular layout, which therefore needs twice the step size.
     M, mu1, mu2 = 5, 0.01, 0.003
     u = coloured(3000, 0.3, seed=5)
     y = np.tanh(u) + 0.4 * np.roll(u, 1) * u
@@ -94,7 +94,7 @@ def test_full_kernel_lms_is_triangular_lms_with_twice_the_step_off_the_diagonal(
     )
 
 
-# --- the same as padasip
+# --- agreement with padasip
 
 
 @pytest.mark.parametrize(
@@ -113,10 +113,10 @@ def test_padasip_gives_the_same(ours, name: str, options: dict) -> None:
     _, errors, history = getattr(filters, name)(n=phi.shape[1], w="zeros", **options).run(y, phi)
     run_ = run(ours, phi, y, keep_every=1)
     scale = np.max(np.abs(y))
-    # padasip's RLS multiplies P out, which costs it digits at the start.
+    # padasip's RLS updates P instead of a root of it, which loses digits at the start.
     tolerance = 1e-10 if name == "FilterRLS" else 1e-13
     np.testing.assert_allclose(run_.errors, errors, atol=tolerance * scale)
-    # Its history holds the weights from before each sample.
+    # The history of padasip contains the weights before each sample.
     np.testing.assert_allclose(run_.path[:-1], history, atol=tolerance * scale)
 
 
@@ -161,7 +161,7 @@ def test_rls_state_holds_the_inverse_gram_matrix() -> None:
 def test_rls_in_single_precision_stays_near_the_exact_answer(lam: float) -> None:
     phi, y = noisy_record(3000, memory=5, a=0.9)
     single = run(RLS(lam, delta=1e6), phi.astype(np.float32), y.astype(np.float32))
-    # The start is 1e6 and the end some 1e-3: more than seven digits between them.
+    # P falls from 1e6 to about 1e-3, by more than the seven digits of single precision.
     assert single.status == "ok"
     np.testing.assert_allclose(single.weights, ridge(phi, y, 1e-6, lam), atol=1e-3)
 
@@ -186,7 +186,7 @@ def test_kalman_is_the_textbook_recursion() -> None:
     for k in range(60):
         e = y[k] - phi[k] @ w
         assert got.errors[k] == pytest.approx(e, abs=1e-11)
-        # The information form, for a reference of another shape than the code.
+        # The reference is in information form, while the code updates the covariance.
         after = np.linalg.inv(np.linalg.inv(C) + np.outer(phi[k], phi[k]) / r)
         w = w + after @ phi[k] * e / r
         C = after + np.diag(q)
@@ -194,6 +194,7 @@ def test_kalman_is_the_textbook_recursion() -> None:
 
 
 def test_kalman_knows_how_far_off_it_is() -> None:
+    """The normalised squared error of the weights has the mean of its chi-square distribution."""
     rng = np.random.default_rng(7)
     misses = []
     for _ in range(60):
@@ -203,15 +204,15 @@ def test_kalman_knows_how_far_off_it_is() -> None:
         got = run(Kalman(q=0.03**2, r=0.25, p0=0.03**2), phi, y)
         miss = w[300] - got.weights
         misses.append(miss @ np.linalg.solve(got.state.P, miss))
-    # Chi-square of 2 degrees: mean 2, and of 60 runs a standard deviation of 2 / sqrt(60) = 0.26.
+    # Chi-square with 2 degrees of freedom: mean 2; standard deviation of the mean 2 / sqrt(60) = 0.26.
     assert np.mean(misses) == pytest.approx(2.0, abs=0.8)
 
 
-# --- where NLMS comes to rest
+# --- fixed point of NLMS
 
 
 def test_nlms_rests_at_its_own_fixed_point_and_not_at_least_squares() -> None:
-    # The cubic is not in the model, so the weight of each sample matters.
+    # The model lacks the cubic term, so the solution depends on the weighting of the samples.
     u = coloured(40_000, 0.5, seed=8)
     phi = volterra(u, 2)
     y = u + 0.5 * u**3 + 0.3 * u**2

@@ -1,4 +1,4 @@
-"""The quick forms of filters equal the plain ones, whatever basis, step sizes and stretch."""
+"""Fast forms of filters agree with the plain recursions, for several bases and step sizes, and in parts."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -25,7 +25,7 @@ N, BEFORE = 150, 12
 
 
 def plain_lms(phi: np.ndarray, y: np.ndarray, mu: np.ndarray, leakage: float = 0.0) -> tuple:
-    """The textbook, in numpy."""
+    """Errors and final weights of LMS by the recursion of textbooks, in NumPy."""
     w, e = np.zeros(phi.shape[1]), np.empty(len(y))
     for k in range(len(y)):
         e[k] = y[k] - w @ phi[k]
@@ -82,7 +82,7 @@ def test_path_and_going_on_are_those_of_stored_regressors(memory: int) -> None:
     phi = basis.regressors(u)[BEFORE:]
     plain, quick = run(filter, phi, y, keep_every=40), run(filter, u, y, basis=basis, keep_every=40)
     np.testing.assert_allclose(quick.path, plain.path, atol=1e-15)
-    # The input of the second part begins with what the delays remember.
+    # The input of the second part contains the earlier samples, which fill the delays.
     cut = 3 * LMS_BLOCK_SAMPLES + 3
     one = run(filter, u[: BEFORE + cut], y[:cut], basis=basis)
     two = run(filter, u, y[cut:], basis=basis, state=one.state)
@@ -117,7 +117,7 @@ def test_rls_in_blocks_goes_on() -> None:
 
 @pytest.mark.parametrize("memory", [5, 12])
 def test_rls_in_blocks_survives_what_an_inverse_matrix_does_not(memory: int) -> None:
-    # One sine excites a few weights only; the others are forgotten, and P spans far more than 16 digits.
+    # One sine excites few directions; with forgetting, eigenvalues of P differ by more than 16 digits.
     t = np.arange(4000)
     u = np.sin(0.3 * t)
     y = u + 0.2 * u**2 + 0.01 * np.random.default_rng(0).normal(size=len(t))

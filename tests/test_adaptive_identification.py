@@ -1,4 +1,4 @@
-"""A filter on a recording: what it starts from, what it ends in, and that its two errors are kept apart."""
+"""A filter on a recording: its start, its final model, and its errors online and with frozen weights."""
 
 import numpy as np
 import pytest
@@ -30,7 +30,7 @@ def test_it_finds_the_weights_and_the_model_simulates() -> None:
 
 
 def test_means_stay_where_they_are() -> None:
-    # About another operating point the same plant has the same weights, as nothing was taken off.
+    # No mean is subtracted, so the weights are the same about another operating point.
     found = identify(RLS(delta=1e8), Volterra(Delays(2)), recording(offset=1.5), "alpha")
     np.testing.assert_allclose(found.run.weights, WEIGHTS, atol=1e-6)
 
@@ -42,7 +42,7 @@ def test_the_filter_starts_at_n_init_with_its_memory_filled() -> None:
     assert n >= 10
     assert found.run.errors.shape == (600 - n,)
     assert found.run.errors[0] == record.channel("alpha")[n]
-    # The second error, by hand: weights after one step from zero.
+    # The second error, from the weights after one step from zero.
     phi = volterra(record.u, 2)[n : n + 2]
     y = record.channel("alpha")[n : n + 2]
     assert found.run.errors[1] == pytest.approx(y[1] - 0.01 * y[0] * phi[0] @ phi[1], abs=1e-14)
@@ -55,7 +55,7 @@ def test_the_lattice_identifies_too() -> None:
         basis = Volterra(Delays(2 + first, first=0) if first == 0 else Delays(2, first=1))
         lattice = identify(VolterraLattice(2, 0.99), basis, train, "alpha")
         direct = identify(RLS(0.99), basis, train, "alpha")
-        # They differ by the few samples before `n_init` and forget them.
+        # The lattice assumes zero input before `n_init`; with forgetting, this difference decays.
         np.testing.assert_allclose(lattice.run.weights, direct.run.weights, atol=0.02)
         np.testing.assert_allclose(lattice.run.errors[-50:], direct.run.errors[-50:], atol=0.02)
     assert lattice.frozen_nmse(test) == pytest.approx(direct.frozen_nmse(test), rel=0.05)
@@ -77,7 +77,8 @@ def test_the_lattice_refuses_regressors_that_are_not_its_own(basis) -> None:
 
 
 def test_moving_weights_look_better_than_the_model_they_make() -> None:
-    # A slow input and a plant that remembers longer than the filter: two taps follow, and know nothing.
+    # The input is slow and the memory of the plant is longer than that of the filter. The two weights
+    # track the output, but frozen they do not predict it.
     def slow(seed: int) -> Recording:
         u = coloured(4000, 0.98, seed)
         y = lags(u, 60) @ np.sin(np.arange(60) / 8)

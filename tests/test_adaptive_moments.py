@@ -1,4 +1,4 @@
-"""Moments of regressors against closed forms, an integration rule and random numbers."""
+"""Moments of regressors against closed forms, Gauss-Hermite quadrature and random samples."""
 
 import itertools
 import json
@@ -56,7 +56,7 @@ def test_eigenvalues_for_a_white_input() -> None:
     np.testing.assert_allclose(quadratic.eigenvalues, [1.0] * 10 + [2.0] * 4 + [7.0], atol=1e-12)
     np.testing.assert_allclose(quadratic.eigenvalues, NUMBERS["eigR2tri_M5_a0"], atol=1e-12)
     every = Moments.gaussian(np.eye(5)).eigenvalues
-    # The constant and the sum of the squares meet in [[1, sqrt 5], [sqrt 5, 7]].
+    # The constant and the sum of the squares are coupled by the block [[1, sqrt 5], [sqrt 5, 7]].
     ends = np.linalg.eigvalsh([[1.0, np.sqrt(5)], [np.sqrt(5), 7.0]])
     np.testing.assert_allclose(every, np.sort([*ends, *[1.0] * 15, *[2.0] * 4]), atol=1e-12)
     assert every[0] == pytest.approx(0.25834, abs=1e-5)
@@ -123,11 +123,11 @@ def test_hermite_regressors_are_white_in_the_second_moments_only() -> None:
     R1 = ar1_covariance(0.8, 3)
     moments = Moments.of_basis(Hermite.of(Volterra(Delays(3)), R1), R1)
     np.testing.assert_allclose(moments.R, np.eye(10), atol=1e-12)
-    # Whatever the colour was, the fourth moments are those of polynomials of independent numbers.
+    # For any colour, the fourth moments are those of Hermite polynomials of independent variables.
     white = Moments.of_basis(Hermite.of(Volterra(Delays(3)), np.eye(3)), np.eye(3))
     W = random_covariance(10, 13)
     np.testing.assert_allclose(moments.S(W), white.S(W), atol=1e-10)
-    assert np.abs(moments.S(np.eye(10)) - 12 * np.eye(10)).max() > 1  # Gaussian ones would have 12 I
+    assert np.abs(moments.S(np.eye(10)) - 12 * np.eye(10)).max() > 1  # Gaussian regressors would have 12 I
 
 
 def test_sample_moments_are_plain_means() -> None:

@@ -1,4 +1,4 @@
-"""What every filter promises: one loop, a state to go on from, derivatives, precision, and honest status."""
+"""Properties of all filters: causality, continuation from a state, precision, derivatives, divergence."""
 
 import jax
 import jax.numpy as jnp
@@ -23,7 +23,7 @@ every_filter = pytest.mark.parametrize("filter", FILTERS.values(), ids=FILTERS)
 
 
 def record(filter, N: int = 200) -> tuple[np.ndarray, np.ndarray]:
-    """What the filter takes: regressors (N, 6), or the input they are made of."""
+    """Regressors (N, 6), or the input from which the filter computes them, and the output."""
     phi, y = noisy_record(N, memory=2)
     return (phi[:, 1] if filter.from_input else phi), y
 
@@ -57,6 +57,7 @@ def test_an_error_knows_nothing_of_its_own_sample_or_later_ones(filter) -> None:
 
 @every_filter
 def test_going_on_from_a_state_is_going_on(filter) -> None:
+    """Two runs, the second from the state of the first, give the same errors and weights as one run."""
     phi, y = record(filter)
     whole = run(filter, phi, y)
     first = run(filter, phi[:77], y[:77])
@@ -132,7 +133,7 @@ def test_new_values_compile_nothing(filter) -> None:
         run(jax.tree.unflatten(shape, [change(x) for x in leaves]), 1.1 * phi, y + 0.1)
     assert _run._cache_size() == compiled
     run(filter, phi[:59], y[:59])
-    assert _run._cache_size() == compiled + 1  # a new length does, so the count works
+    assert _run._cache_size() == compiled + 1  # a new length compiles, which shows that the count works
 
 
 @every_filter
@@ -207,7 +208,7 @@ def test_a_state_for_larger_outputs_does_not_diverge_on_smaller_ones() -> None:
     assert run(LMS(0.5), phi, np.full(50, 1e-3), state=first.state).status == "ok"
 
 
-# --- what makes no sense
+# --- invalid arguments
 
 
 @pytest.mark.parametrize(

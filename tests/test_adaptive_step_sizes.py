@@ -1,4 +1,4 @@
-"""Bounds, misadjustment and settling of LMS against brute force, known numbers and long runs."""
+"""Bounds, misadjustment and settling of LMS against direct computation, published values and long runs."""
 
 import numpy as np
 import pytest
@@ -64,7 +64,7 @@ def test_mean_square_bounds_of_coloured_inputs(
     a: float, linear: float, quadratic: float, both: float
 ) -> None:
     R1 = ar1_covariance(a, 5)
-    # The reference has two digits only, so half of the last one comes on top of the 3 %.
+    # The reference is rounded, so half of its last digit is added to the tolerance of 3 %.
     for degrees, expected in (((1,), linear), ((2,), quadratic), ((0, 1, 2), both)):
         rounding = 0.0005 if expected > 0.1 else 0.00005
         found = mean_square_bound(Moments.gaussian(R1, degrees))
@@ -90,7 +90,7 @@ def test_rule_of_thumb_is_unsafe_for_coloured_squares() -> None:
 
 
 def test_full_layout_has_the_bound_of_the_triangular_one_with_doubled_products() -> None:
-    # Both filters make the same errors, so they leave stability together; the full one is singular.
+    # Both filters have the same errors and so the same bound, although R of the full layout is singular.
     full = Moments.gaussian(ar1_covariance(0.5, 5), (0, 1, 2), "full")
     triangular = Moments.gaussian(ar1_covariance(0.5, 5))
     doubled = BASIS.step_sizes({0: 1.0, 1: 1.0, 2: 1.0}, as_full=True)
@@ -128,19 +128,19 @@ def test_small_step_misadjustment(mu2: float, theory: float, tolerance: float) -
     moments = Moments.gaussian(np.eye(5), (1, 2))
     found = analyse(moments, np.r_[np.full(5, 0.01), np.full(15, mu2)])
     assert found.small_step == pytest.approx(theory, rel=tolerance)
-    # Fourth moments only add to it.
+    # Fourth moments increase the misadjustment.
     assert found.small_step < found.misadjustment < 1.15 * found.small_step
 
 
 def long_run_misadjustment(mu: np.ndarray, independent: bool, seed: int, N: int = 300_000) -> float:
-    """Excess of the a-priori error of LMS around known weights, over white noise of variance 1."""
+    """Excess mean-square error of LMS from the true weights, which are zero, with noise of variance 1."""
     rng = np.random.default_rng(seed)
     phi = monomials(rng.standard_normal((N, 5))) if independent else BASIS.regressors(rng.standard_normal(N))
     noise = rng.standard_normal(N)
     result = run(LMS(mu), phi, noise)
     assert not result.diverged
     settled = N // 10
-    # The noise is known: what the weights add to it is measured without its own scatter.
+    # The noise is known and subtracted, so that its scatter does not enter the excess error.
     return float(np.mean((result.errors - noise)[settled:] ** 2))
 
 
@@ -149,7 +149,7 @@ def test_misadjustment_of_independent_samples_is_the_exact_one() -> None:
     exact = analyse(WHITE, mu)
     measured = long_run_misadjustment(mu, independent=True, seed=1)
     assert measured == pytest.approx(exact.misadjustment, rel=0.05)
-    # Here the small-step rule is already too low by more than that.
+    # At these step sizes, the formula for small steps is too low by more than 15 %.
     assert exact.small_step < 0.85 * measured
 
 
@@ -207,7 +207,7 @@ def test_step_size_that_settles_after_7000_samples(eigenvalue: float, expected: 
 
 
 def test_settling_time_measured_on_a_series_of_the_class_is_the_one_asked_for() -> None:
-    # Off-diagonal quadratic weights are modes of their own under a white input, with eigenvalue 1.
+    # Under a white input, each off-diagonal quadratic weight is a separate mode with eigenvalue 1.
     rng = np.random.default_rng(4)
     w = rng.uniform(0.5, 1.0, 21) * rng.choice([-1.0, 1.0], 21)
     products = np.array([name.count("u[t") == 2 for name in BASIS.names])

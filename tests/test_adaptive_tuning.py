@@ -1,4 +1,4 @@
-"""Tuning: derivatives against differences, the search against a grid, and what divergence may do."""
+"""Tuning: derivatives against differences, descent against a grid, and the treatment of divergence."""
 
 import jax
 import jax.numpy as jnp
@@ -38,7 +38,7 @@ def cut(u: np.ndarray, y: np.ndarray, Ts: float, parts: int, n_init: int = 10) -
 
 @pytest.fixture(scope="module")
 def joint() -> list[Recording]:
-    """Friction, dead zone and a voltage offset at 10 samples a second: eight blocks of 4000."""
+    """Eight recordings at 10 Hz with 4000 scored samples: a joint with friction, dead zone and offset."""
     u = noise(32_080, 0.1, bandwidth=2.0, seed=0)
     alpha = response(plant("S6"), u, 0.1, step=0.01)[:, 1]
     alpha = alpha + 1e-3 * np.random.default_rng(1).standard_normal(len(u))
@@ -47,7 +47,7 @@ def joint() -> list[Recording]:
 
 @pytest.fixture(scope="module")
 def short() -> list[Recording]:
-    """A series of the class with noise: three blocks of 300."""
+    """Three recordings of 300 samples: a Volterra series of the model class with noise."""
     rng = np.random.default_rng(2)
     u = rng.standard_normal(900)
     y = BASIS.regressors(u) @ rng.standard_normal(21) + 0.5 * rng.standard_normal(900)
@@ -99,7 +99,7 @@ def test_derivative_is_that_of_central_differences(
 ) -> None:
     with double_precision():
         data = tuning_data(BASIS, joint[:4], "alpha", objective)
-        # A margin that these step sizes do not keep, so that the penalty takes part.
+        # These step sizes violate the margin, so that the penalty is active.
         guard = Margin(sample_moments(data.phi), 200.0) if guarded else None
         options = {"curve": BOTH, "build": two_steps, "objective": objective}
         x, h = np.log([0.004, 4e-4]), 1e-5
@@ -127,7 +127,7 @@ def test_gradient_is_no_worse_than_a_grid_of_225_at_a_third_of_its_cost(
     tried = grid(two_steps, GRID, BASIS, train, "alpha", objective=objective, test=test)
     found = tune(two_steps, STARTS, BASIS, train, "alpha", objective=objective, test=test)
     assert tried.evaluations == 225
-    assert found.evaluations <= 75  # all four starts together
+    assert found.evaluations <= 75  # sum over the four starts
     for path in found.paths:
         assert path.values[-1] <= tried.value
         assert path.values[-1] == pytest.approx(found.value, rel=1e-4)
@@ -136,7 +136,7 @@ def test_gradient_is_no_worse_than_a_grid_of_225_at_a_third_of_its_cost(
     assert found.stability is not None
     assert found.stability.stable
     assert tried.values.shape == (15, 15)
-    assert not tried.values[-1, -1] < 1e6  # the grid reaches beyond stability
+    assert not tried.values[-1, -1] < 1e6  # the grid contains unstable step sizes
 
 
 def test_theory_predicts_what_the_tuned_filter_leaves(joint: list[Recording]) -> None:
@@ -183,7 +183,7 @@ def test_a_margin_is_kept(short: list[Recording]) -> None:
     least = 3 * free.stability.factor
     kept = tune(two_steps, STARTS[0], BASIS, short, "alpha", objective="mean_error", margin=least)
     assert kept.stability is not None
-    # A penalty bends, it does not forbid.
+    # The margin is a penalty and no constraint, so that it is not reached completely.
     assert kept.stability.factor > 0.6 * least
     assert kept.stability.factor > 1.5 * free.stability.factor
     assert kept.value > free.value
@@ -244,7 +244,7 @@ def test_a_pole_is_found_through_the_filter() -> None:
     )
     assert found.settings["pole"] == pytest.approx(0.8, abs=0.01)
     assert found.basis.bank.poles[0].real == pytest.approx(found.settings["pole"])  # type: ignore[attr-defined]
-    # The noise is what is left of the variance.
+    # What remains of the variance is the noise.
     assert found.value == pytest.approx(0.05**2 / np.var(y), rel=0.15)
 
 
@@ -272,7 +272,7 @@ def test_other_numbers_compile_nothing_anew(short: list[Recording]) -> None:
 
 def test_descent_survives_points_without_a_value() -> None:
     def banana(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Rosenbrock's valley, with a wall as steep as the errors of a filter that begins to diverge."""
+        """Rosenbrock's function plus an exponential, as steep as the error of a diverging filter."""
         x, y = points.T
         wall = np.exp(np.minimum(60 * (x - 1.15), 300))
         value = (1 - x) ** 2 + 100 * (y - x**2) ** 2 + wall
@@ -282,7 +282,7 @@ def test_descent_survives_points_without_a_value() -> None:
 
     found = descend(banana, np.array([[-1.2, 1.0], [0.5, 2.0], [1.5, 1.5]]), 200)
     for place in found:
-        np.testing.assert_allclose(place.points[-1], 1.0, atol=0.02)  # the wall shifts it by 0.004
+        np.testing.assert_allclose(place.points[-1], 1.0, atol=0.02)  # the exponential shifts it by 0.004
         assert place.status == "minimum"
         steps = np.abs(np.diff(place.points, axis=0))
         assert np.max(steps) <= 1.0 + 1e-12

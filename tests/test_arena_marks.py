@@ -1,4 +1,4 @@
-"""Draws of several effects, and the promises that a set of records keeps or breaks."""
+"""Draws of several effects, and statistics of results: intervals, sets of effects, confusion, pages."""
 
 import math
 
@@ -14,7 +14,7 @@ from rotflex_jax.parameters import Estimate, Specification
 
 
 def row(effects, rounds=(), **more):
-    """A record as the benchmark keeps it."""
+    """A row of results in the format of the benchmark."""
     wanted = more.pop("wanted", effects)
     answers = [{"effect": e, "port": p, "equivalent": []} for e, p in rounds]
     marks = scored(wanted, list(rounds), [[] for _ in rounds], "found")
@@ -32,7 +32,7 @@ def test_draws_are_fixed_different_and_of_effects_that_are_apart():
     for group_ in (*pairs, *triples):
         assert not set(group_) & ABSORBED
         assert all(b not in EQUIVALENT.get(a, set()) for a in group_ for b in group_)
-    assert not apart(HUB, ("dahl", "hub"))  # two frictions of one port are one friction
+    assert not apart(HUB, ("dahl", "hub"))  # two frictions at one port cannot be distinguished
     assert not apart(HUB, ARM) and apart(HUB, DELAY)
 
 
@@ -101,7 +101,7 @@ def test_errors_carry_the_deviation():
 
 
 def test_a_page_of_any_records(tmp_path):
-    """Also of records that no confusion can be drawn of."""
+    """The confusion figure is left out without effects of full size, and all files without valid results."""
     usual = {"verdict_right": True, "cpu_s": 1.0, "verdict": "found"}
     one, smaller = row([HUB], [HUB], **usual), row([HUB], [HUB], size=0.3, **usual)
     names = lambda records: [f.name for f in publish(records, tmp_path / "B0.json")]  # noqa: E731

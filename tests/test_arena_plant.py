@@ -1,4 +1,4 @@
-"""The arena's simulator against closed forms, an event-driven solver and itself."""
+"""The arena's simulator against closed forms, an event-driven solver, and other runs of itself."""
 
 import itertools
 import json
@@ -19,8 +19,8 @@ HUB, JOINT = 0.03, 0.003
 SYMMETRIC = {("coulomb", "hub"): {"level": HUB}, ("coulomb", "joint"): {"level": JOINT}}
 FRICTION = {**SYMMETRIC, ("dead_zone", "input"): {"width": 0.1}}
 
-# theta, alpha and their speeds after a pulse of 2 V for 1 s with `FRICTION`, by a first-order
-# time stepping at 5 us that is not this code; its own error is a few 1e-6 rad.
+# Sample (1 ms) -> theta, alpha and their speeds under a pulse of 2 V for 1 s with `FRICTION`, by an
+# independent first-order time stepping with a step of 5 us. Its error is a few 1e-6 rad.
 PULSE = {
     50: (0.09268544940821673, -0.08488455636388197, 2.2628588877652307, -1.7393254617966911),
     500: (1.3998933811858636, -0.001844745430944242, 3.2460163873521988, 0.0),
@@ -59,7 +59,7 @@ def event_driven(u: float, start: np.ndarray, end: float, t_eval: np.ndarray) ->
         return np.array([hub, arm - hub]), np.array(friction)
 
     def consistent(x, forced):
-        """The one mode in which no stuck port is overloaded and every start is outwards."""
+        """The mode in which no sticking port exceeds its level and no starting port accelerates backwards."""
         choices = [
             [forced[i]] if i in forced else ([0, 1, -1] if x[2 + i] == 0 else [np.sign(x[2 + i])])
             for i in range(2)
@@ -122,7 +122,7 @@ def test_pulse_agrees_with_an_event_driven_solver(pulse):
     exact = np.vstack([rising, falling[1:]])
     np.testing.assert_allclose(pulse[:, :2], exact[:, :2], atol=3e-6)
     np.testing.assert_allclose(pulse[:, 2:], exact[:, 2:], atol=1e-4)
-    # Both stick in this test, so the agreement is about sticking too.
+    # Both ports stick at times, so the agreement includes sticking.
     assert (exact[:, 2] == 0).any() and (exact[1:, 3] == 0).any()
 
 
@@ -223,7 +223,7 @@ def test_steady_turning_balances_the_torques(effect, port, sign):
 
 
 def test_joint_damping_laws_take_their_power():
-    # Energy lost by the bare joint equals the work done by each law at the joint.
+    # The energy that the joint loses equals the work of both damping laws together.
     plant = p.Plant(B_hub=0.0, B_joint=0.0, k_t=0.0)
     given = {(name, "joint"): parameters((name, "joint")) for name in ("viscous", "quadratic_drag")}
     x = p.simulate(plant, laws(given), np.zeros(5000), 1e-4, start=(0.0, 0.1, 0.0, 0.0))
@@ -277,6 +277,7 @@ def test_asymmetric_friction_is_symmetric_friction_and_a_constant_torque():
 
 
 def test_what_cannot_be_seen_cannot_be_seen():
+    """Effects that a damping of the plant or a gain of the input can replace give the same motion."""
     for effect, port in ABSORBED:
         value = parameters((effect, port))["coefficient"]
         damped = p.Plant(**{f"B_{port}": getattr(p.Plant(), f"B_{port}") + value})
@@ -298,6 +299,7 @@ def test_inputs_are_about_one_volt(kind):
 
 
 def test_a_record_is_its_seed():
+    """One seed gives one recording; input and plant do not depend on the hidden effects."""
     once, again, other = (make_record([("coulomb", "hub")], seed=s, seconds=1.0) for s in (3, 3, 4))
     assert np.array_equal(once["y"], again["y"]) and once["truth"] == again["truth"]
     assert not np.array_equal(once["u"], other["u"])

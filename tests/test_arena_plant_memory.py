@@ -45,7 +45,7 @@ Torques = Callable[[float, np.ndarray, float], tuple[np.ndarray, np.ndarray]]
 
 
 def integrated(plant: p.Plant, law: Torques, inner: np.ndarray, u: np.ndarray, hold: int) -> np.ndarray:
-    """The joint with torques on hub, arm and joint, by scipy, at every change of the voltage."""
+    """States at every change of the voltage, by scipy, of the joint with torques on hub, arm and joint."""
     A, b = linear(plant)
     M = np.array([[plant.J_hub + plant.J_arm, plant.J_arm], [plant.J_arm, plant.J_arm]])
 
@@ -102,6 +102,7 @@ def test_delay_changes_the_voltage_between_samples(time):
 
 
 def test_the_voltage_is_bent_before_it_is_late():
+    """Offset and dead zone act on the voltage before the delay."""
     path = {
         ("dead_zone", "input"): {"width": 0.2},
         ("voltage_offset", "input"): {"offset": 0.3},
@@ -114,7 +115,7 @@ def test_the_voltage_is_bent_before_it_is_late():
     np.testing.assert_allclose(*both, atol=1e-12)
 
 
-# Torques of the moment.
+# Torques without memory.
 
 
 def test_cogging_is_a_potential():
@@ -139,7 +140,7 @@ def test_play_in_the_joint_carries_no_torque():
     inside = np.flatnonzero(np.abs(x[:, 1]) > play)[0]
     assert (x[:inside, 2] == 1.0).all()
     np.testing.assert_allclose(x[:inside, 3], speed, rtol=1e-12)
-    # Each half period is half a turn of the spring and twice the play at constant speed.
+    # Half a period is half an oscillation of the spring and a gap of twice the play at constant speed.
     rate = np.sqrt(FREE.K * (1 / FREE.J_hub + 1 / FREE.J_arm))
     ups = np.flatnonzero((x[:-1, 1] < 0) & (x[1:, 1] >= 0))
     period = np.diff(ups[-5:]).mean() * 1e-4
@@ -147,7 +148,7 @@ def test_play_in_the_joint_carries_no_torque():
     assert np.abs(x[:, 1]).max() == pytest.approx(play + speed / rate, rel=1e-4)
 
 
-# Torques that build up.
+# Torques with memory.
 
 
 def rise(values: dict[str, float], s: float) -> float:
@@ -193,7 +194,7 @@ def test_hysteretic_torques_agree_with_scipy(place):
 
 @pytest.mark.parametrize("beta", [1.0, 0.5, 0.2])
 def test_hysteresis_loop_has_its_area(beta):
-    # One steady cycle of a sine: the work per cycle, by quadrature along a solution by scipy.
+    # The work of one steady cycle of a sine; the reference is a quadrature along a solution by scipy.
     values = {"level": 0.02, "width": 0.02, "beta": beta}
     row = laws({("bouc_wen", "joint"): values}).hysteresis[0]
     h, N = 1e-4, 10000
@@ -224,7 +225,7 @@ def test_steady_turning_meets_the_full_level(place, sign):
 
 
 def test_presliding_is_a_spring_until_it_slides():
-    # A quarter of the level: the hub settles where the torque has built up to that, and is held.
+    # The motor torque is a quarter of the level: the hub settles where the friction torque equals it.
     plant, values = p.Plant(K=0.0, B_joint=0.0), {"level": 0.04, "presliding": 0.01}
     volts = 0.01 / plant.torque_per_volt
     x = p.course(plant, laws({("dahl", "hub"): values}), np.full(2000, volts), TS)
@@ -306,7 +307,7 @@ def test_the_rotor_flies_free_in_the_gap():
 
 
 def test_impact_keeps_momentum_and_takes_energy():
-    # Nothing but the two halves of the hub: one flies, they meet once, both go on together.
+    # Only rotor and hub: the rotor moves freely, hits the hub once, and both move on together.
     plant = p.Plant(B_hub=0.0, B_joint=0.0, K=0.0, k_m=0.0)
     u = np.zeros(3000)
     u[:300] = 1.0
@@ -332,13 +333,14 @@ def test_the_gap_is_never_exceeded():
 
 
 def test_no_play_is_no_gear():
+    """With a play of 1e-9 rad, the gear gives the motion of the joint without backlash."""
     u = noise(1000)
     almost, none = geared(u, TS, p.Plant(), play=1e-9).motion, p.simulate(p.Plant(), NONE, u, TS)
     np.testing.assert_allclose(almost[:, :2], none[:, :2], atol=1e-7)
 
 
 def gear_by_events(plant: p.Plant, u: np.ndarray, hold: int, Ts: float) -> np.ndarray:
-    """Hub, deflection, rotor and their speeds by scipy, which looks for contact and release."""
+    """Hub, deflection, rotor and their speeds by scipy, with contact and release as events."""
     J_r, J_h, J_a = ROTOR_SHARE * plant.J_hub, (1 - ROTOR_SHARE) * plant.J_hub, plant.J_arm
     gain, emf, half = plant.torque_per_volt, plant.k_m * plant.K_g, PLAY / 2
 
@@ -416,11 +418,11 @@ def test_only_the_ratio_of_two_gains_shows():
     assert EQUIVALENT["sensor_gain", "theta"] == {("sensor_gain", "alpha")}
 
 
-# What the package has no name for.
+# Effects outside the catalogue of the package.
 
 
 def test_outside_effects_agree_with_scipy():
-    elsewhere = {"patchy_friction", "slack_cable"}  # tested on their own
+    elsewhere = {"patchy_friction", "slack_cable"}  # tested separately
     v = {place[0]: parameters(place) for place in OUTSIDE if place[0] not in elsewhere}
     plant, u = p.Plant(), noise(300, hold=30)
 
@@ -437,7 +439,7 @@ def test_outside_effects_agree_with_scipy():
 
 
 def test_patchy_friction_depends_on_the_angle():
-    # A turning hub alone: the energy taken is the level's integral over the angle.
+    # A hub that turns alone: the energy lost is the integral of the friction level over the angle.
     plant, v = p.Plant(B_hub=0.0, B_joint=0.0, K=0.0, k_t=0.0), {"level": 0.04, "share": 0.8}
     x = p.simulate(plant, laws({("patchy_friction", "hub"): v}), np.zeros(100), TS, (0.3, 0.0, 9.0, 0.0))
     theta, energy = x[:, 0], plant.J_hub * x[:, 2] ** 2 / 2
@@ -446,14 +448,14 @@ def test_patchy_friction_depends_on_the_angle():
     np.testing.assert_allclose(energy[0] - energy, taken, atol=1e-6)
 
 
-# All of them.
+# All effects.
 
 
 @pytest.mark.parametrize("place", [q for q in (*DEFAULTS, *OUTSIDE) if q[0] not in OLD], ids="@".join)
 def test_halving_the_step_changes_nothing_that_an_encoder_sees(place):
     given = laws({place: parameters(place)})
     coarse, fine = (p.simulate(p.Plant(), given, noise(1000), TS, step=s) for s in (2e-5, 1e-5))
-    # Two counts are 3e-3, and their noise is 3e-4.
+    # The tolerance is a tenth of the jitter of the encoder, and a fiftieth of its count.
     np.testing.assert_allclose(coarse[:, :2], fine[:, :2], atol=3e-5)
 
 

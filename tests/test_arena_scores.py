@@ -1,4 +1,4 @@
-"""Scores of methods: answers made by hand, a stranger's file, failures, what a method is given."""
+"""Scores of methods: constructed answers, methods in files of users, failures, data a method receives."""
 
 import json
 import math
@@ -84,10 +84,10 @@ def test_probabilities_too_small_to_count_have_no_calibration():
 
 def test_one_name_always_is_an_alarm_wherever_it_is_not_true():
     s = scored([said(COULOMB, p={COULOMB: 0.9})] * 6)
-    # Right on the record that hides it alone; of two effects it names one.
+    # Right only where it is the one hidden effect; of two effects it names one.
     assert (s.right, s.named, s.worlds) == ((1, 6), (2, 3), (0, 1))
     assert (s.alarms, s.withheld, s.wrong, s.worlds_wrong) == ((2, 2), (0, 1), 3, 1)
-    # Claimed 0.9 six times, held twice.
+    # The probability 0.9 is claimed six times, and the effect is there twice.
     assert s.calibration == pytest.approx(0.9 - 2 / 6)
     assert s.brier == pytest.approx((2 * 0.1**2 + 4 * 0.9**2) / 6)
 
@@ -137,7 +137,7 @@ def test_what_is_no_answer_is_refused_in_a_sentence():
 
 @pytest.fixture(scope="module")
 def three() -> list[Problem]:
-    """Three short records of one seed."""
+    """Three short problems of one seed."""
     return drawn(3, 11, 4.0)
 
 
@@ -153,7 +153,7 @@ def test_records_are_those_of_their_seed(three):
 
 
 def drawn_kinds(records, seed):
-    """The kinds of records, none of them simulated."""
+    """Problems with drawn kinds, without any simulation."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(of, "_record", lambda kind, places, *_: problem(kind, places))
         patch.setattr(of, "_world", lambda _: problem(WORLD))
@@ -161,7 +161,7 @@ def drawn_kinds(records, seed):
 
 
 def reachable(value, seen):
-    """All that can be reached from an object by attributes, items and the arrays behind arrays."""
+    """Collect in `seen` what can be reached from an object by attributes, items and bases of arrays."""
     if id(value) in seen or callable(value) or isinstance(value, type(sys) | type):
         return
     seen[id(value)] = value
@@ -179,7 +179,7 @@ def test_a_method_cannot_reach_the_truth(three):
         given, asked = pickle.loads(p.given()), pickle.loads(p.asked())
         seen: dict = {}
         reachable((given, asked), seen)
-        # Of the test recordings only voltage and first samples, not even behind an array.
+        # Of the test recordings, only voltage and first samples can be reached, also through bases of arrays.
         arrays = [v for v in seen.values() if isinstance(v, np.ndarray) and v.dtype == float]
         for r in p.runs():
             last = set(r.y[-300:, 0].tolist()) - {0.0}
@@ -211,7 +211,7 @@ def test_a_recording_does_not_tell_where_it_is_from(three):
 
 
 class Truth:
-    """A model that is the sensor's own record, off by a known number of deviations."""
+    """A model that returns the measured outputs plus a known number of standard deviations of the sensors."""
 
     def __init__(self, problem, off):
         self.known = {
@@ -402,7 +402,7 @@ def test_measured_machines_count_by_the_error_of_free_runs(measured):
 
 
 def moving(q, v, a, Ts=0.002) -> Motion:
-    """A motion of a joint with some linear balance."""
+    """A motion of a joint with random linear dynamics."""
     rng = np.random.default_rng(4)
     A = np.vstack([np.hstack([np.zeros((2, 2)), np.eye(2)]), -np.abs(rng.normal(size=(2, 4)))])
     mass = np.array([[3.0, 1.0], [1.0, 2.0]])
@@ -419,14 +419,14 @@ ACCELERATIONS = np.stack([-3.2 * np.sin(2 * t), -2.5 * np.sin(5 * t + 1)], 1)
 
 
 def column(m: Motion, place, which=0):
-    """The first term of an effect."""
+    """One column of the regression term of an effect."""
     return next(x for x in terms(m) if x.place == place).columns[:, :, which]
 
 
 def test_regressions_have_a_column_for_the_catalogue():
     named = {x.place for x in terms(moving(ANGLES, SPEEDS, ACCELERATIONS))}
     wanted = {(kind.name, port) for kind, port in search_places(rf.joints.paper())}
-    own = {("viscous", "hub"), ("viscous", "joint")}  # which the joint has
+    own = {("viscous", "hub"), ("viscous", "joint")}  # effects that the joint already has
     in_time = {("voltage_drift", "input"), ("periodic_disturbance", "input")}
     assert wanted - named == own | in_time | {("backlash", "hub")}
 
@@ -461,16 +461,16 @@ def test_states_along_a_motion_are_those_of_their_laws():
     built = _hysteresis(steady, np.ones(400), 0.02, 1.0, Ts)
     way = s * Ts * np.arange(1, 401)
     np.testing.assert_allclose(built, 1 - np.exp(-way / 0.02), rtol=1e-12)
-    # With beta = 1/2 the torque goes back along a straight line.
+    # With beta = 1/2 the torque returns along a straight line.
     there = _hysteresis(np.concatenate([steady, -steady[:20]]), np.ones(420), 0.02, 0.0, Ts)
     np.testing.assert_allclose(np.diff(there[399:]), -s * Ts / 0.02, rtol=1e-9)
-    # A shaken mass far below its resonance follows its port.
+    # Far below its resonance, the mass follows its port.
     m = moving(ANGLES, SPEEDS, ACCELERATIONS)
     torque = column(m, ("second_mode", "hub"))
     late = slice(1000, None)
     np.testing.assert_allclose(torque[late, 0], ACCELERATIONS[late, 0], atol=0.05 * 3.2)
     assert not np.any(torque[:, 1])
-    # Of a slow input a lag takes away time times slope: the next term is 2 % of that.
+    # For a slow input, a lag subtracts its time constant times the slope. The next term is 2 % of that.
     lag = column(m, ("lag", "input"))[late, 0]
     np.testing.assert_allclose(lag, 0.003 * 7 * np.sin(7 * t[late]), atol=6e-4)
 

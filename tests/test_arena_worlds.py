@@ -1,4 +1,4 @@
-"""The arena's feedback loop against solve_ivp, and the wrong worlds that it records."""
+"""The arena's feedback loop against solve_ivp, and its recordings of wrong worlds."""
 
 import dataclasses
 import json
@@ -46,7 +46,7 @@ def test_designed_loops_settle_on_the_textbook_model(kind):
 
 
 def test_motion_under_feedback_is_that_of_solve_ivp():
-    """Two more modes, a push around one position and a torque of time, under the recorded voltage."""
+    """With two more modes, a torque around one position and one over time, under the recorded voltage."""
     plant = Plant(B_joint=0.001)
     hub = {"inertia": 4e-4, "frequency": 15.0, "damping": 0.02}
     arm = {"inertia": 3e-4, "frequency": 30.0, "damping": 0.01}
@@ -63,7 +63,7 @@ def test_motion_under_feedback_is_that_of_solve_ivp():
     k2, d2 = (2 * np.pi * arm["frequency"]) ** 2, 4 * np.pi * arm["damping"] * arm["frequency"]
 
     def flow(_, x, drive):
-        theta, beta, r1, r2, w, v, s1, s2 = x  # beta, r1, r2: angles against the table
+        theta, beta, r1, r2, w, v, s1, s2 = x  # beta, r1, r2: absolute angles of arm and oscillators
         a1, a2 = k1 * (theta - r1) + d1 * (w - s1), k2 * (beta - r2) + d2 * (v - s2)
         joint = plant.K * (beta - theta) + plant.B_joint * (v - w)
         pushed = push["amplitude"] * np.exp(-(((theta - push["centre"]) / push["width"]) ** 2))
@@ -124,6 +124,7 @@ def test_voltage_sample_by_sample_is_the_voltage_of_a_whole_record():
 
 
 def test_what_is_between_angle_and_reading():
+    """A reading contains shares of modes, cross-talk, a delay, and noise of known standard deviation."""
     places = {("second_mode", "hub"): {"inertia": 4e-4, "frequency": 15.0, "damping": 0.02}}
     rng = lambda: np.random.default_rng(0)  # noqa: E731
     run = lambda s: recorded(Plant(), laws(places), s, PD, np.full(200, 0.3), Ts, rng())  # noqa: E731
@@ -142,7 +143,7 @@ def test_what_is_between_angle_and_reading():
 
 @pytest.mark.parametrize("link", [True, False])
 def test_a_gauge_shows_no_oscillator_that_is_not_there(link):
-    """What is absent rests at zero: shown as a deflection, it would be the angle of hub or arm."""
+    """An absent oscillator has the state 0: a gauge with a share of it would show the angle of the port."""
     drawn = [_modes(np.random.default_rng(seed), link).values for seed in range(40)]
     assert {tuple(d["modes"]) for d in drawn} == ({("hub",), ("hub", "arm")} if link else {("arm",)})
     for d in drawn:
@@ -171,7 +172,7 @@ def test_a_row_of_worlds_hides_every_effect():
         assert {p for kind, p in hidden if kind == "joint"} - {None} == set(HIDDEN)
         assert {p for kind, p in hidden if kind == "link"} >= {("lugre", "hub"), ("coulomb", "hub"), None}
     for place in HIDDEN:
-        make_record({place: dict.fromkeys(HIDDEN[place], 0.01)}, seconds=0.05)  # known to the plant, by name
+        make_record({place: dict.fromkeys(HIDDEN[place], 0.01)}, seconds=0.05)  # the plant accepts the names
 
 
 @pytest.mark.parametrize("seed", [404, 405])
@@ -191,9 +192,9 @@ def test_a_world_is_three_runs_of_one_machine_and_always_the_same(seed):
         "validation",
     }
     assert len(w.besides) >= 3
-    json.dumps(told(w))  # a row of results
+    json.dumps(told(w))  # can be stored in a row of results
     assert w.model.free_names == rf.joints.paper().free_names
-    assert w.truth["plant"]["R_m"] != Plant.R_m  # which the model trusts
+    assert w.truth["plant"]["R_m"] != Plant.R_m  # a trusted parameter of the model
 
 
 def test_marks_of_a_world():
@@ -222,7 +223,7 @@ def test_page_of_worlds(tmp_path):
     error = {"theta": 0.02, "alpha": None}
     kinds = ("whole", "windows", "whole_calibrated", "windows_calibrated")
     stages = {stage: dict.fromkeys(kinds, error) for stage in ("baseline", "final")}
-    stages["final"] |= {k: {"theta": 9.0, "alpha": 9.0} for k in kinds[:2]}  # another offset: not compared
+    stages["final"] |= {k: {"theta": 9.0, "alpha": 9.0} for k in kinds[:2]}  # not calibrated: not on the page
     rounds = [{"effect": "coulomb", "port": "hub", "equivalent": [], "status": "provisional"}]
     row = {
         "world": 300,
@@ -241,7 +242,7 @@ def test_page_of_worlds(tmp_path):
     text = page.read_text()
     assert "| link with gauge | 1 | 1/1 | 0/1 | 1/1 | 0 in 0/1 worlds |" in text and "world 301: x" in text
     assert "(coulomb@hub)" in text and text.count("1.15 / - -> 1.15 / -") == 3 and "515" not in text
-    # Worlds that were read before a revision are summed apart.
+    # Worlds whose results were read before a revision of the search are summed separately.
     (page,) = publish_worlds([row, {**row, "world": 3012}], tmp_path / "B0_wrong_worlds.json")
     first, second = page.read_text().split("Worlds 3000 to 3069, which were read before")
     for part in (first, second):

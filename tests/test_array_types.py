@@ -18,14 +18,14 @@ def rms(x: Float[np.ndarray, " N"]) -> float:
 
 @dataclasses.dataclass
 class Pair:
-    """Two of one length."""
+    """Two arrays of equal length."""
 
     a: Float[np.ndarray, " N"]
     b: Float[np.ndarray, " N"]
 
     @property
     def wrong(self) -> Float[np.ndarray, "N N"]:
-        """Not what it says."""
+        """A vector, although a matrix is annotated."""
         return self.a
 
 

@@ -1,4 +1,4 @@
-"""Bad input, kind by kind: each is refused with one sentence that names what is wrong."""
+"""Kinds of bad input: each is refused with one sentence that names the fault."""
 
 import pickle
 import re
@@ -29,7 +29,7 @@ GOOD: dict[str, Any] = {
 
 
 def changed(**columns: Any) -> dict[str, Any]:
-    """Good columns, except for some; a pair is an index and the value to put there."""
+    """The good columns, some of them removed (None), changed at one sample (index, value) or replaced."""
     run = {name: values.copy() for name, values in GOOD.items()}
     for name, value in columns.items():
         if value is None:
@@ -52,7 +52,7 @@ def edited(k: int, line: str | None) -> Callable[[list[str]], list[str]]:
 
 
 def late(k: int, by: float) -> np.ndarray:
-    """Time stamps of which one is late, or all from there on if it is late by more than one."""
+    """Time stamps with stamp `k` shifted by `by` [s], and all later ones too from one sampling period on."""
     t = GOOD["t"].copy()
     t[k : k + 1 if abs(by) < 0.002 else None] += by
     return t
@@ -62,7 +62,7 @@ MEASURED = 0.3 * np.sin(np.arange(N) / 6)
 NAMED_IN_DEGREES = "t,voltage,theta_deg,alpha_deg"
 OWN_NAMES: dict[str, Any] = {"outputs": ("theta_deg", "alpha_deg")}
 
-# What the file holds, what load is given, what the sentence must say.
+# Kind -> content of the file, options of `load`, pattern that the message must match.
 CONTENT: dict[str, tuple[bytes, dict[str, Any], str]] = {
     "empty": (b"", {}, "is empty"),
     "blank": (b"\n  \n\n", {}, "no text in it"),
@@ -177,7 +177,7 @@ CONTENT: dict[str, tuple[bytes, dict[str, Any], str]] = {
 
 
 def refused(do: Callable[[], object], phrase: str) -> None:
-    """The error says it, in one sentence of readable length, and shows no Python inside."""
+    """Assert an InputError that matches the phrase, in one short sentence without terms of NumPy."""
     with pytest.raises(InputError) as caught:
         do()
     sentence = str(caught.value)
@@ -227,7 +227,7 @@ def array_file() -> bytes:
 
 def huge(path: Path) -> None:
     with path.open("wb") as file:
-        file.truncate(2_100_000_000)  # sparse: takes no room on the disk
+        file.truncate(2_100_000_000)  # a sparse file takes no space on the disk
 
 
 FILES: dict[str, tuple[str, Callable[[Path], object], str]] = {

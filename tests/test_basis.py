@@ -1,4 +1,4 @@
-"""Delays and Volterra products against convolution, sums written out, and each other."""
+"""Delays and Volterra products against convolution, explicit sums, and each other."""
 
 import itertools
 
@@ -21,7 +21,7 @@ def noise(N: int, seed: int = 0) -> np.ndarray:
 
 
 def by_hand(u: np.ndarray, kernels: dict) -> np.ndarray:
-    """The sums over all delays, one by one."""
+    """Output of Volterra kernels, by explicit sums over all delays."""
     length = len(next(iter(h for d, h in kernels.items() if d)))
     lags = np.stack([np.concatenate([np.zeros(k), u])[: len(u)] for k in range(length)], axis=1)
     y = np.full(len(u), float(kernels.get(0, 0.0)))
@@ -55,7 +55,7 @@ def test_kernels_in_delays_give_what_the_weights_give(bank, degrees, layout) -> 
     u, w = noise(14), noise(basis.size, 1)
     kernels = basis.kernels(w, length=14)
     assert set(kernels) == {0, *degrees}
-    # 1.3e-13 is what sums of this length cost in double precision.
+    # 1.3e-13 is the rounding error of sums of this length in double precision.
     np.testing.assert_allclose(by_hand(u, kernels), basis.regressors(u) @ w, atol=1.3e-13)
     for d in degrees:
         for axes in itertools.permutations(range(d)):
@@ -74,13 +74,14 @@ def test_weights_come_back_from_their_kernels(order, constant, layout, gobf, see
     basis = Volterra(GOBF if gobf else Delays(3), order, constant=constant, layout=layout)
     w, u = noise(basis.size, seed), noise(30, seed + 1)
     back = basis.weights(basis.kernels(w, 30))
-    # In the full layout only the symmetric part of the weights shows in the output.
+    # In the full layout only the symmetric part of the weights affects the output.
     np.testing.assert_allclose(basis.regressors(u) @ back, basis.regressors(u) @ w, atol=1e-11)
     if layout == "triangular":
         np.testing.assert_allclose(back, w, atol=1e-11)
 
 
 def test_an_unsymmetric_kernel_is_worth_its_symmetric_part() -> None:
+    """Weights of an unsymmetric kernel give its output, and their kernel is its symmetric part."""
     basis = Volterra(Delays(4))
     H = noise(16).reshape(4, 4)
     u = noise(30, 2)
@@ -95,7 +96,7 @@ def test_full_and_triangular_layouts_are_one_model() -> None:
     w, u = noise(31), noise(100, 1)
     same = triangular.weights(full.kernels(w))
     np.testing.assert_allclose(full.regressors(u) @ w, triangular.regressors(u) @ same, atol=1e-13)
-    # A product with two orders has both weights of the full layout together.
+    # The weight of a mixed product is the sum of its two weights in the full layout.
     one = full.indices.index((0, 1)), full.indices.index((1, 0))
     assert same[triangular.indices.index((0, 1))] == pytest.approx(w[one[0]] + w[one[1]], abs=1e-14)
 
@@ -136,7 +137,7 @@ def test_step_sizes_by_degree() -> None:
     full, triangular = Volterra(Delays(3), layout="full"), Volterra(Delays(3))
     sizes = {0: 0.3, 1: 0.1, 2: 0.01}
     u, e = noise(10), 0.7
-    # A step of the full filter, folded into the triangular layout, is that of `as_full`.
+    # A step of the filter in the full layout, converted to the triangular one, equals that of `as_full`.
     moved = full.weights(full.kernels(full.step_sizes(sizes) * e * full.regressors(u)[-1]))
     folded = triangular.weights(full.kernels(moved))
     own = triangular.step_sizes(sizes, as_full=True) * e * triangular.regressors(u)[-1]
@@ -162,7 +163,7 @@ def test_other_values_compile_nothing() -> None:
     Volterra(Orthonormal((-0.4, 0.1 + 0.7j, 0.1 - 0.7j)), 2).regressors(2 * u)
     assert _respond._cache_size() == compiled
     Volterra(Orthonormal((0.5, 0.4)), 2).regressors(u)
-    assert _respond._cache_size() == compiled + 1  # other kinds of poles do, so the count works
+    assert _respond._cache_size() == compiled + 1  # other kinds of poles compile, so the count works
 
 
 @pytest.mark.parametrize(
@@ -199,5 +200,6 @@ def test_bad_input_is_told_in_a_sentence(make, sentence: str) -> None:
 
 
 def test_the_best_approximation_is_there_for_the_asking() -> None:
+    """With an infinite tolerance, a kernel longer than the bank is approximated instead of refused."""
     w = Volterra(Delays(2), 1).weights({1: np.ones(3)}, tolerance=np.inf)
     np.testing.assert_allclose(w, [0.0, 1.0, 1.0], atol=1e-15)

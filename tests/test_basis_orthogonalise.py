@@ -1,4 +1,4 @@
-"""Regressors turned orthonormal: Gram matrix, span, and what it takes for them to close."""
+"""Orthonormal regressors: Gram matrix, span, and the degrees that a basis must contain."""
 
 import numpy as np
 import pytest
@@ -24,7 +24,7 @@ def gram(phi: np.ndarray) -> np.ndarray:
 
 
 def unexplained(targets: np.ndarray, phi: np.ndarray) -> float:
-    """Largest part of a column that the others do not span."""
+    """Largest relative part of a column of `targets` that `phi` does not span."""
     left = targets - phi @ np.linalg.lstsq(phi, targets, rcond=None)[0]
     return float(np.max(np.linalg.norm(left, axis=0) / np.linalg.norm(targets, axis=0)))
 
@@ -35,14 +35,14 @@ def test_hermite_products_are_orthonormal_for_a_gaussian_input(a: float) -> None
     basis = Hermite.of(raw, toeplitz(a, 5))
     u = coloured(400_000, a)
     G = gram(basis.regressors(u)[10:])
-    # Fourth powers over 400,000 samples that hang together: about 0.01 to 0.03 by chance.
+    # Fourth moments of 400,000 correlated samples scatter by about 0.01 to 0.03.
     assert np.max(np.abs(G - np.eye(21))) < (0.03 if a < 0.9 else 0.15)
     assert np.linalg.cond(gram(raw.regressors(u)[10:])) > 80
     assert np.linalg.cond(G) < (1.2 if a < 0.9 else 1.5)
 
 
 def test_moments_of_hermite_products_are_exact_under_quadrature() -> None:
-    # Gauss-Hermite points integrate polynomials under a Gaussian without any sample.
+    # Gauss-Hermite quadrature integrates polynomials of Gaussian variables exactly.
     points, weights = np.polynomial.hermite_e.hermegauss(8)
     v = np.stack(np.meshgrid(points, points, indexing="ij"), axis=-1).reshape(-1, 2)
     weight = np.outer(weights, weights).ravel() / (2 * np.pi)
@@ -92,10 +92,10 @@ def test_without_the_constant_the_hermite_span_is_not_closed() -> None:
     raw = Volterra(Delays(3), constant=False)
     with pytest.raises(InputError, match=r"of degree 2 contain terms of degree 0.*add the constant"):
         Hermite.of(raw, np.eye(3))
-    # And rightly: no weights on the raw squares give v^2 - 1.
+    # No combination of the raw regressors equals v^2 - 1.
     phi = raw.regressors(coloured(3000, 0.5))
     assert unexplained((phi[:, 3:4] - 1) / np.sqrt(2), phi) > 0.3
-    # Odd degrees close without it, and a sample needs no law.
+    # Odd degrees need no constant, and Gram-Schmidt on a sample needs none.
     assert Hermite.of(Volterra(Delays(3), degrees=(1, 3), constant=False), np.eye(3)).size == 13
     assert GramSchmidt.of(raw, coloured(3000, 0.5)).size == 9
 
@@ -108,11 +108,11 @@ def test_cubes_need_the_linear_terms() -> None:
 def test_gram_schmidt_is_exact_on_its_sample_and_leaves_doubles_out() -> None:
     u = coloured(2000, 0.8)
     basis = GramSchmidt.of(Volterra(Delays(4), layout="full"), u)
-    assert basis.size == 15  # 21 columns, 6 of them twice
+    assert basis.size == 15  # 21 columns, 6 of them duplicates
     np.testing.assert_allclose(gram(basis.regressors(u)), np.eye(15), atol=1e-11)
     assert basis.degrees.tolist() == [0] + [1] * 4 + [2] * 10
     assert basis.names[:2] == ("1", "GS(u[t])")
-    # Triangular by order: the first linear regressor knows nothing of the quadratic ones.
+    # The transform is triangular: the first linear regressor contains no quadratic ones.
     assert np.all(np.asarray(basis.transform)[5:, 1] == 0)
 
 

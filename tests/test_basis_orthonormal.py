@@ -1,4 +1,4 @@
-"""Orthonormal filters against transfer functions, their Gram matrix, and the plant that has their poles."""
+"""Orthonormal filters against transfer functions, by their Gram matrix, and on a plant with their poles."""
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +18,7 @@ def noise(N: int, seed: int = 0) -> np.ndarray:
 
 
 def chained(sections: list, u: np.ndarray) -> np.ndarray:
-    """Functions and all-passes of the transfer functions, one sample late, by scipy."""
+    """Outputs of a chain of sections with all-passes between them, delayed by one sample, by scipy."""
     columns, through = [], np.concatenate([[0.0], u[:-1]])
     for numerators, allpass, denominator in sections:
         columns += [lfilter(numerator, denominator, through) for numerator in numerators]
@@ -54,11 +54,11 @@ def test_kautz_is_its_transfer_function(p: complex) -> None:
 def test_mixed_poles_are_the_chain_of_their_sections() -> None:
     u, p = noise(400), 0.6 + 0.5j
     expected = chained([real_section(0.9), pair_section(p), real_section(-0.2)], u)
-    # The conjugate may stand anywhere after its partner.
+    # The conjugate may be listed anywhere after its partner.
     bank = Orthonormal((0.9, p, -0.2, p.conjugate()))
     np.testing.assert_allclose(bank.outputs(u), expected, atol=1e-12)
     assert bank.poles == (0.9, p, p.conjugate(), -0.2)
-    assert bank.outputs(u).dtype == np.float64  # and never complex
+    assert bank.outputs(u).dtype == np.float64  # real in spite of complex poles
 
 
 @settings(max_examples=15, deadline=None, derandomize=True)
@@ -75,7 +75,7 @@ def test_any_poles_give_orthonormal_functions(real: list, pairs: list) -> None:
     B = bank.impulse_responses(3000)
     assert np.max(np.abs(B.T @ B - np.eye(len(poles)))) < 1e-10
     assert bank.size == len(poles)
-    # What is left beyond the reach is a millionth.
+    # The energy of the impulse responses beyond the reach is negligible.
     assert np.max(np.sum(B[bank.reach :] ** 2, axis=0)) < 1e-11
 
 

@@ -1,4 +1,4 @@
-"""What banks can reach, against the published tables, and the search for poles."""
+"""Least errors of filter banks against published tables, and the optimisation of poles."""
 
 import numpy as np
 import pytest
@@ -31,7 +31,7 @@ FIVE_DELAYS = {
     50: (0.0682, 0.0665, 0.0596, 0.0463),
     100: (0.00054, 0.00054, 0.00055, 0.00067),
 }
-# Ts [ms]: delays that reach 10 %, 1 % and 0.1 % under white noise.
+# Ts [ms]: numbers of delays for errors of 10 %, 1 % and 0.1 % under white noise.
 MEMORY = {
     1: (191, 334, 411),
     2: (96, 168, 206),
@@ -71,7 +71,7 @@ def test_least_error_is_what_long_records_come_to() -> None:
     assert e @ e / (y @ y) == pytest.approx(found, rel=0.02)
     R1 = bank_covariance(Delays(5), ar1(a, 5))
     np.testing.assert_allclose(phi.T @ phi / len(u), R1, atol=0.02)
-    # Filters colour what is white, unless they are orthonormal.
+    # Outputs of orthonormal filters are uncorrelated if the input is white.
     bank = Orthonormal.at(POLES, Ts)
     np.testing.assert_allclose(bank_covariance(bank), np.eye(3), atol=1e-10)
     z = bank.outputs(u)
@@ -89,7 +89,7 @@ def test_kautz_functions_reach_what_the_table_says(ms: int) -> None:
     for count, expected in zip((2, 4, 6), KAUTZ[ms], strict=True):
         bank = Orthonormal.kautz(np.exp(POLES[1] * Ts), count)
         assert minimum_nmse(bank, h) == pytest.approx(expected, rel=0.03)
-    # The resonance without back-EMF is the wrong pole, whatever the number.
+    # Six functions with the resonance without back-EMF, a wrong pole, leave a large error.
     wrong = minimum_nmse(Orthonormal.kautz(np.exp((-1.6 + 32.2j) * Ts), 6), h)
     assert wrong == pytest.approx({1: 0.396, 20: 0.397, 50: 0.404}[ms], abs=1e-3)
 
@@ -120,7 +120,7 @@ def test_poles_of_a_linear_plant_are_found_from_afar() -> None:
     np.testing.assert_allclose(
         np.sort_complex(bank.continuous_poles(Ts)), np.sort_complex(np.array(POLES)), atol=1e-6
     )
-    # All starts tell the same, the best first.
+    # All starts end at the same error; they are listed with the best first.
     assert [start.nmse < 1e-15 for start in search.starts] == [True] * 3
     assert np.all(np.diff([start.nmse for start in search.starts]) >= 0)
     assert "converged" in str(search)
@@ -135,7 +135,7 @@ def test_friction_moves_the_poles_towards_the_locked_mode() -> None:
     bank, search = optimise_poles(u, y, start.poles, starts=1)
     assert search.status == "converged"
     real, pair = bank.continuous_poles(Ts)[:2]
-    assert real.real == pytest.approx(-49.3, abs=5.0)  # the joint's own is -34.8
+    assert real.real == pytest.approx(-49.3, abs=5.0)  # -34.8 without friction
     assert pair == pytest.approx(-7.1 + 17.1j, abs=0.3)
     phi = Volterra(start, 1).regressors(u)
     e = y - phi @ np.linalg.lstsq(phi, y, rcond=None)[0]
@@ -190,13 +190,13 @@ def test_several_recordings_count_together_and_skipped_samples_do_not() -> None:
 
 
 def test_a_pole_never_leaves_the_unit_circle() -> None:
-    # An integrator has its pole on the circle: the search runs towards it, and says so.
+    # An integrator has its pole on the unit circle: the search approaches it and returns a status.
     u = noise(500, 0.01, seed=4)
     bank, search = optimise_poles(u, np.cumsum(u), [0.9], starts=2)
     assert all(abs(p) < 1 for p in bank.poles)
     assert bank.poles[0].real > 0.99
     assert search.status
-    # A negative pole stays one.
+    # A negative pole stays negative.
     y = Orthonormal((-0.6,)).outputs(u)[:, 0]
     assert optimise_poles(u, y, [-0.2], starts=1)[0].poles[0].real == pytest.approx(-0.6, abs=1e-7)
 

@@ -1,4 +1,4 @@
-"""Many recordings: every one is a row, none is lost, none is done twice without need."""
+"""Searches of many recordings: each gives a row, none is lost, and none is repeated without need."""
 
 import csv
 import functools
@@ -30,7 +30,7 @@ HERE = os.environ | {"PYTHONPATH": str(Path(rf.__path__[0]).parent)}
 
 
 def write(file: Path, seed: int, volts: float) -> Path:
-    """A short recording; searches of these tests look only at how loud it is."""
+    """Write a short recording; the verdict of the replaced search depends on its voltage only."""
     rng = np.random.default_rng(seed)
     u = volts * rng.normal(size=100 + 20 * seed)
     columns = np.c_[0.002 * np.arange(len(u)), u, 1e-3 * np.cumsum(u), 1e-3 * u]
@@ -41,7 +41,7 @@ def write(file: Path, seed: int, volts: float) -> Path:
 
 @pytest.fixture(autouse=True)
 def no_page(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The page takes longer than all else; only the tests that read it need it."""
+    """Skip the page, which takes longest, except in the tests that read it."""
     if "page" not in request.node.name:
         monkeypatch.setattr(page, "render", lambda fleet: "")
 
@@ -57,7 +57,7 @@ def serial(files: list[Path], tmp_path: Path) -> Fleet:
 
 
 def answers(found: Fleet) -> list[dict]:
-    """All that was found, without the time it took."""
+    """Rows of the results without their times."""
     rows = found.to_dict()["recordings"]
     return [{k: v for k, v in row.items() if k != "seconds"} for row in rows]
 
@@ -107,7 +107,7 @@ def test_a_second_call_repeats_only_what_has_changed(files, serial, tmp_path) ->
     assert [line.split(": ")[1] for line in said] == ["run_2", "more"]
     assert changed.rows[2].verdict == "found"
     assert [r.known for r in changed.rows] == [True, True, False, True, True, True, False]
-    # A result that was cut off or is of another kind is no result.
+    # A truncated result is discarded, and its recording is searched again.
     (serial.folder / "recordings" / "run_4.json").write_text('{"schema": 1, "state": "done", "dig')
     said.clear()
     again(files)
@@ -134,7 +134,7 @@ def test_other_questions_are_not_answered_from_disk(change, files, tmp_path) -> 
 
 
 def test_the_digest_is_the_same_in_another_process(files, serial) -> None:
-    """Sets have another order there; the recording would be searched again."""
+    """Sets have another order in another process; a digest that depends on it would repeat the searches."""
     program = f"""
 import batch_search, sys
 import rotflex_jax as rf
@@ -148,7 +148,7 @@ sys.exit(0 if all(r.known for r in rows) else 5)
 
 
 def test_functions_among_the_arguments_are_digested_by_their_names() -> None:
-    """With their addresses, which differ in each process, a fleet that was stopped would begin again."""
+    """Addresses differ between processes; with them in the digest, a stopped batch would start again."""
 
     def asked(say: Any) -> str:
         return storage._named(functools.partial(batch_search.quick, hold=[say, functools.partial(say, 1)]))
@@ -171,7 +171,7 @@ def test_what_is_wrong_with_one_recording_is_a_row_of_the_page(files, tmp_path) 
     assert found.rows[3].reason == "ZeroDivisionError: a fault of the program"
     text = html.unescape(found.page.read_text()).replace("\u00a0", " ")
     assert all(r.reason in text for r in found.failed)
-    # Bad data stay bad; what looks like an accident is worth another try.
+    # Refused data are not tried again; a recording with another error is.
     assert [r.known for r in call().rows] == [True, True, True, False]
 
 
@@ -183,7 +183,7 @@ def test_names_that_collide_get_files_of_their_own(tmp_path) -> None:
 
 
 def test_a_process_that_dies_costs_no_recording(files, serial, tmp_path, monkeypatch) -> None:
-    """One recording kills its process at the first try, another one always."""
+    """One recording kills its process at the first attempt, another one always."""
     monkeypatch.setattr(workers, "MOST_ATTEMPTS", 2)
     deadly = write(tmp_path / "deadly.csv", 1, 6.0)
     (tmp_path / "marks").mkdir()
@@ -243,7 +243,7 @@ def test_bad_arguments_are_refused(change, words, files, tmp_path, monkeypatch) 
 
 @pytest.fixture
 def scheduler(tmp_path: Path) -> Iterator[str]:
-    """A scheduler and two workers, programs of their own on loopback."""
+    """A Dask scheduler and two workers, as separate processes on the loopback interface."""
     pytest.importorskip("distributed")
     contact = tmp_path / "scheduler.json"
     shared = ["--no-dashboard", "--scheduler-file", str(contact)]
@@ -272,7 +272,7 @@ def until(true: Callable[[], object], seconds: float = 60) -> None:
 
 
 def test_a_cluster_finishes_though_a_worker_is_killed(scheduler, tmp_path) -> None:
-    """Both workers are at a recording when one is killed; that recording is begun again."""
+    """One worker is killed while both search a recording; its recording is searched again."""
     files = [write(tmp_path / f"run_{k}.csv", k, 3.0 if k % 2 else 0.3) for k in range(50)]
     serial = fleet(JOINT, files, folder=tmp_path / "serial", workers=0, search=batch_search.quick)
     room = tmp_path / "room"
@@ -283,7 +283,7 @@ def test_a_cluster_finishes_though_a_worker_is_killed(scheduler, tmp_path) -> No
         try:
             until(lambda: len(set(running())) == 2)
             os.kill(int(running()[0]), signal.SIGKILL)
-        finally:  # nobody waits for a thread that has failed
+        finally:  # also after a failure, since others wait for this
             (room / "go").touch()
 
     killer = threading.Thread(target=kill)
@@ -309,7 +309,7 @@ def test_a_scheduler_that_dies_is_said_in_one_sentence(moment, scheduler, tmp_pa
     def kill() -> None:
         try:
             until((room / "running").exists)
-        finally:  # nobody waits for a thread that has failed
+        finally:  # also after a failure, since others wait for this
             os.kill(number, signal.SIGKILL)
 
     if moment == "between recordings":
@@ -391,7 +391,7 @@ def test_a_result_that_was_changed_is_no_result(damage, files, tmp_path) -> None
 
 
 def text_of(script: str) -> str:
-    """Of the search and the effect of a main program."""
+    """Text for the digest of the search and the effect that a main program defines."""
     names: dict = {"__name__": "__main__"}
     exec(compile(script.replace("@register\n", ""), "main.py", "exec"), names)
     return code_text([names["search"], names["Drag"]])

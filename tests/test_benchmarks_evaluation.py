@@ -1,4 +1,4 @@
-"""What the benchmarks say of a search on test data."""
+"""Errors of searches on test data, as the benchmarks compute and list them."""
 
 import math
 from types import SimpleNamespace
@@ -17,7 +17,7 @@ JOINT = rf.joints.paper(hub_damping=0.004, joint_damping=0.003)
 
 
 def drifting(offset: float, seed: int = 7) -> rf.Recording:
-    """A linear joint under an offset of the voltage, by the arena's own plant."""
+    """A recording of a linear joint with an offset of the voltage, by the arena's simulator."""
     made = make_record({("voltage_offset", "input"): {"offset": offset}}, seed=seed, seconds=6.0, perturb=0.0)
     return rf.Recording(u=made["u"], y=made["y"], Ts=made["Ts"])
 
@@ -31,7 +31,7 @@ def test_calibration_finds_the_offset_of_a_recording(model):
     free = model.simulate(record)
     own = evaluation.errors(model, [record])
     assert own["whole"] == rf.metrics.rmse(record, free)
-    # Counting and jitter are 5e-4 rad; the offset alone is worth a hundred times as much.
+    # Quantisation and jitter are 5e-4 rad; the offset alone causes an error a hundred times as large.
     assert own["whole"]["theta"] > 0.05 > 0.01 > own["whole_calibrated"]["theta"]
     assert own["windows_calibrated"]["theta"] < 0.004 < own["windows"]["theta"]
 
@@ -80,6 +80,7 @@ def test_every_measured_machine_has_its_place():
 
 
 def test_what_judges_was_not_learnt_from():
+    """Test data of the measured machines do not overlap with training and validation data."""
     record = drifting(0.0)
     way = halves(record)
     assert sum(r.N for part in (way.train, way.validation, way.test) for r in part) == record.N
@@ -93,7 +94,7 @@ def test_what_judges_was_not_learnt_from():
             seen = {(r.y.tobytes(), r.start) for r in (*w.train, *w.validation)}
             assert w.test and not seen & {(r.y.tobytes(), r.start) for r in w.test}
             ends = {r.source: r.start + r.N * r.Ts for r in (*w.train, *w.validation)}
-            # Of one run the test is what comes after all that was learnt from.
+            # Within one run, test data come after all training and validation data.
             assert all(r.start >= ends.get(r.source, 0.0) - 1e-9 for r in w.test)
 
 

@@ -1,4 +1,4 @@
-"""Results that documents quote: from committed code, and which code they measure; bounds of shares."""
+"""Results that documents quote: their commits, the code that they measure, and bounds of shares."""
 
 import json
 from pathlib import Path
@@ -17,7 +17,7 @@ FILES = sorted(RESULTS.rglob("*.json"))
 def test_results_come_from_committed_code(file: Path) -> None:
     runs = runs_that_count(json.loads(file.read_text(encoding="utf-8")))
     assert runs, f"{file.name} does not say what made it; see benchmarks/origin.py"
-    # `stored`: from before results said what made them; the commit that they came with.
+    # `stored`: results older than the record of origins, with the commit that added them.
     changed = [run.get("date") for run in runs if of_changed_tree(run) and not run.get("stored")]
     assert not changed, f"{file.name}: run it again from a committed tree"
 
@@ -40,7 +40,7 @@ def test_what_counts_as_committed(run: dict[str, Any], refused: bool) -> None:
 
 
 def project(folder: Path, **modules: str) -> Imports:
-    """A package with benchmarks; names of modules with `__` in the place of `/`."""
+    """Write a package with benchmarks; `__` in the name of a module stands for `/`."""
     for name, text in modules.items():
         file = folder / (name.replace("__", "/").replace("/init", "/__init__") + ".py")
         file.parent.mkdir(parents=True, exist_ok=True)
@@ -76,7 +76,7 @@ def test_the_arena_measures_the_search() -> None:
     assert {f"rotflex_jax/{name}.py" for name in parts} <= measured
     assert "benchmarks/arena/trial.py" in measured
     assert not any(path.startswith(("rotflex_jax/report", "rotflex_jax/cli")) for path in measured)
-    # A table of a benchmark shows; the one of `compare` computes errors.
+    # Tables of benchmarks only format results, but the table of `compare` computes errors.
     assert not any(path.startswith("benchmarks") and path.endswith("table.py") for path in measured)
     assert "rotflex_jax/compare/table.py" in Imports().sources("B5_compare")
 
@@ -115,7 +115,7 @@ def test_results_are_of_an_earlier_version_once_what_they_measure_has_changed(tm
     sources = {"s": {"benchmarks/B1.py": meaning("a = 1")}}
     results = {"runs": [run], "sources": sources, "rows": {"x": {"code": "one"}}}
     assert standing(results, tmp_path) == (True, (), ())
-    # A run of which no row is left does not count; one that rows are of, and that is not there, does.
+    # A run without remaining rows does not count; a missing run that rows refer to does.
     runs = [{"commit": "old", "clean": False, "code": "two"}, run]
     assert standing({**results, "runs": runs}, tmp_path).present
     assert standing({**results, "runs": runs, "parts": {"fits": "two"}}, tmp_path).of == ("old with changes",)
@@ -127,13 +127,13 @@ def test_results_are_of_an_earlier_version_once_what_they_measure_has_changed(tm
     project(other, benchmarks__B1="a = 2\n")
     assert standing(results, other) == (False, ("abc",), ("benchmarks/B1.py",))
     assert standing(results, tmp_path / "gone").changed == ("benchmarks/B1.py",)
-    # What shows changes no number, though a run may have noted its digest.
+    # Tables of benchmarks only format, so a changed one does not count, even if a run recorded its digest.
     shown = {"s": sources["s"] | {"benchmarks/arena/wrong_table.py": "before"}}
     assert standing({**results, "sources": shown}, tmp_path).present
-    # A benchmark of pages is measured by its own results, whatever its name.
+    # The script of a benchmark counts, also with the name of a page.
     pages = {"s": sources["s"] | {"benchmarks/B8_pages.py": "before"}}
     assert standing({**results, "sources": pages}, tmp_path).changed == ("benchmarks/B8_pages.py",)
-    # So are files that a benchmark names, and modules of the package that are called so.
+    # Modules of the package with names of pages and tables count too.
     named = {
         "s": sources["s"] | {f"rotflex_jax/{name}.py": "before" for name in ("report/page", "compare/table")}
     }
@@ -152,7 +152,7 @@ def test_a_run_says_what_made_it(monkeypatch) -> None:
     part(results, "coulomb")
     assert runs_that_count(results) == [run]
     assert standing(results).changed == ()
-    # Other changes beside the same sources are forgotten once it runs on a clean tree; other sources are not.
+    # A run on a clean tree replaces runs of the same sources on a changed tree, not runs of other sources.
     said = {"rev-parse": "abc", "status": ""}
     monkeypatch.setattr("origin.git", lambda *command: said[command[0]])
     other = {**run, "clean": False, "sources": "others"}
@@ -165,6 +165,7 @@ def test_a_run_says_what_made_it(monkeypatch) -> None:
 
 
 def test_what_is_said_beside_numbers(tmp_path: Path, monkeypatch) -> None:
+    """The remark lists benchmarks with results of an earlier version, grouped by commits."""
     monkeypatch.setattr("origin.RESULTS", tmp_path)
     (tmp_path / "B5").mkdir()
     for name, commit in (("B1", "abc"), ("B2", "abc"), ("B5/a", "def"), ("B5/b", "abc")):
@@ -176,7 +177,7 @@ def test_what_is_said_beside_numbers(tmp_path: Path, monkeypatch) -> None:
 
 @pytest.mark.parametrize(("k", "n"), [(0, 116), (0, 1), (3, 60), (59, 60)])
 def test_a_share_that_is_not_excluded(k: int, n: int) -> None:
-    """With it, k or fewer of n are seen in one case of twenty."""
+    """At the bound, the binomial probability of k or fewer of n is 5 % by scipy."""
     assert scipy.stats.binom.cdf(k, n, most(k, n)) == pytest.approx(0.05)
 
 

@@ -1,4 +1,4 @@
-"""The tables beside the seed paper: the exact ones, what counts as agreement, and the stored results."""
+"""Tables compared with the seed paper: exact values, the rule of agreement, and the stored results."""
 
 import json
 from pathlib import Path
@@ -31,7 +31,7 @@ def response(Ts: float, length: int) -> np.ndarray:
 @pytest.mark.parametrize("Ts", [0.02, 0.1])
 @pytest.mark.parametrize("cutoff", [None, 5.0])
 def test_wiener_error_is_what_least_squares_leaves_of_the_covariance(Ts: float, cutoff: float | None) -> None:
-    # Reference: h in the metric of the covariance, projected by plain least squares.
+    # Reference: least squares weighted by a root of the covariance.
     h = response(Ts, round(2 / Ts))
     a = np.exp(-2 * np.pi * cutoff * Ts) if cutoff else 0.0
     R = toeplitz(a ** np.arange(len(h)))

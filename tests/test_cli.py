@@ -1,4 +1,4 @@
-"""The command line: what it accepts, what it refuses and how, what it prints."""
+"""The command line: accepted and refused arguments, error messages, and output."""
 
 import dataclasses
 import functools
@@ -31,16 +31,16 @@ DEMO_WHOLE = np.loadtxt(
     files("rotflex_jax.data").joinpath("demo.csv").read_text().splitlines(), delimiter=",", skiprows=1
 )
 DEMO = DEMO_WHOLE[:600]
-IN_THE_ROOM = np.eye(4)  # the angle of the arm in the room instead of its deflection
+IN_THE_ROOM = np.eye(4)  # absolute angle of the arm instead of its deflection
 IN_THE_ROOM[2, 3] = 1.0
 WAVE = np.sin(np.arange(len(DEMO)) / 50)
-# A process of its own finds the package wherever it was started.
+# Environment in which a separate process finds the package from any folder.
 HERE = os.environ | {"PYTHONPATH": str(Path(rf.__path__[0]).parent)}
 
 
 @pytest.fixture(autouse=True)
 def no_global_settings(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What the program sets up for its own process must not leak into the other tests."""
+    """Settings that the program makes for its process must not affect other tests."""
     monkeypatch.setattr(xla, "enable_fast_loops", lambda: True)
     monkeypatch.setattr(xla, "enable_compilation_cache", lambda: None)
 
@@ -73,7 +73,7 @@ def put(table: np.ndarray, column: int, value: float) -> np.ndarray:
     return table
 
 
-# What is wrong -> how to spoil the table, and words that the sentence must have.
+# Fault -> function that adds it to the table, and a word that the message must contain.
 SPOILT: dict[str, tuple[Callable[[np.ndarray], np.ndarray], str]] = {
     "a value that is not a number": (lambda x: put(x, 2, np.nan), "theta"),
     "an infinite voltage": (lambda x: put(x, 1, np.inf), "voltage"),
@@ -112,7 +112,7 @@ def assert_one_sentence(err: str, *words: str) -> None:
         assert word.lower() in err.lower()
 
 
-# Command line, {run} for a good recording and {tmp} for a folder -> words of the sentence.
+# Command line, {run} for a good recording and {tmp} for a folder -> words of the message.
 REFUSED = {
     "discover": "FILE",
     "discover {tmp}/missing.csv": "does not exist",
@@ -334,7 +334,7 @@ BASE = "acceleration of the base [m/s^2]"
 
 @pytest.fixture
 def pushed(tmp_path: Path) -> Path:
-    """A recording with more columns: what else acts on the machine."""
+    """A recording with further columns, for signals that act on the machine."""
     more = np.column_stack([DEMO, WAVE, 2 * WAVE, 3 * WAVE])
     return write(tmp_path / "pushed.csv", more, (*NAMES, BASE, "i2", "a=b"))
 
@@ -346,7 +346,7 @@ def pushed(tmp_path: Path) -> Path:
         (("i2",), {"i2": 2}),
         (("Acceleration of the Base", "I2"), {BASE: 1, "i2": 2}),
         (("second motor [A]=i2", f"base = {BASE}"), {"second motor [A]": 2, "base": 1}),
-        (("third [N]=a=b",), {"third [N]": 3}),  # a column with this sign needs a name before it
+        (("third [N]=a=b",), {"third [N]": 3}),  # a column with "=" in its name needs a name before it
     ],
 )
 def test_signals_are_read_where_they_are_named(options, found, run, search, pushed) -> None:
@@ -370,7 +370,7 @@ def test_check_lists_signals_beside_input_and_outputs(run, pushed) -> None:
 
 
 def test_a_signal_that_drives_the_model_is_read_by_its_name(run, pushed, recorded, tmp_path) -> None:
-    """As outputs are, unless --signal says which column has it."""
+    """A signal is read from the column of its name, as outputs are, unless --signal gives another column."""
     pushing = rf.effects.MeasuredDisturbance(at=f"arm: {BASE}", gain=0.02)
     model = Model(rf.joints.paper() + pushing)
     file = model.save(tmp_path / "model.json")
@@ -394,7 +394,7 @@ def test_a_signal_that_drives_the_model_is_read_by_its_name(run, pushed, recorde
 
 
 class FakeSearch:
-    """Stands for `rf.discover` where only the command line around it is tested."""
+    """Replacement of `rf.discover` in tests of the command line around it."""
 
     def __init__(self) -> None:
         self.calls: list[tuple] = []
@@ -486,7 +486,7 @@ def test_a_file_with_one_sensor_has_its_joint(
 
 
 def test_several_files_validate_each_other(run, search, recorded, tmp_path) -> None:
-    """Unless --split or --held-out is given; a test file is passed on as such."""
+    """Without --split and --held-out, no validation data are passed on; --test is passed on as test data."""
     other, third = (write(tmp_path / name, DEMO[:400]) for name in ("other.csv", "third.csv"))
     status, out, _ = run("discover", recorded, other, "--test", third, "--calibrate", 1)
     assert status == 0
@@ -568,7 +568,7 @@ def test_a_report_that_fails_costs_no_result(
     out, kept = tmp_path / "r.json", tmp_path / "model.json"
 
     def broken(folder: Path) -> Path:
-        assert json.loads(out.read_text())["verdict"] == "found"  # given out before
+        assert json.loads(out.read_text())["verdict"] == "found"  # written before the report
         raise error
 
     def searched(*given, progress, **options) -> SimpleNamespace:
@@ -635,7 +635,7 @@ print(enable_compilation_cache())
 
 @pytest.mark.slow
 def test_discover_on_the_demo_recording(run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A real search behind the command; of two effects, since finding among all is shown elsewhere."""
+    """The command with a real search, but two candidates only; all candidates are tested elsewhere."""
     pairs = [(rf.effects.Coulomb, "hub"), (rf.effects.CubicSpring, "joint")]
     monkeypatch.setattr(rf, "discover", functools.partial(rf.discover, candidates=pairs, rounds=1))
     status, out, err = run("discover", write(tmp_path / "demo.csv", DEMO_WHOLE[:2000]), "--json", "-")
@@ -654,7 +654,7 @@ def test_remarks_of_the_compiler_do_not_reach_the_terminal(
 ) -> None:
     monkeypatch.setattr(sys, "argv", ["rotflex", "--version"])
     monkeypatch.setattr("rotflex_jax.cli.stopping.STOP.listen", lambda: None)
-    monkeypatch.setenv("TF_CPP_MIN_LOG_LEVEL", chosen or "")  # given back afterwards
+    monkeypatch.setenv("TF_CPP_MIN_LOG_LEVEL", chosen or "")  # restored afterwards
     if chosen is None:
         del os.environ["TF_CPP_MIN_LOG_LEVEL"]
     with pytest.raises(SystemExit):

@@ -1,4 +1,4 @@
-"""`rotflex discover --each`: what it accepts, what it refuses and how, what it prints."""
+"""`rotflex discover --each`: accepted and refused arguments, error messages, and output."""
 
 import functools
 import importlib
@@ -20,7 +20,7 @@ from rotflex_jax.text.numbers import digits
 def run(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> Callable[[str], tuple[int, str, str]]:
-    """The command line in this process, with a search that takes no time."""
+    """The command line in this process, with an instant replacement of the search."""
     fleet = importlib.import_module("rotflex_jax.batch")
     monkeypatch.setattr(fleet, "fleet", functools.partial(fleet.fleet, search=batch_search.quick))
     monkeypatch.setattr(xla, "enable_fast_start", lambda: None)  # global settings
@@ -46,7 +46,7 @@ def test_every_file_is_searched_by_itself(run) -> None:
     lines = {line.split()[0]: line for line in out.splitlines() if line}
     assert "nothing missing" in lines["run_0"]
     assert "coulomb@hub" in lines["run_1"]
-    # The sentence speaks of options, not of arguments.
+    # The message names options of the command line, not arguments of Python.
     assert lines["torn"].startswith("torn failed: ")
     assert "--output" in lines["torn"]
     table = np.loadtxt("run_1.csv", delimiter=",", skiprows=1)
@@ -112,7 +112,7 @@ def test_bad_arguments_are_refused_with_one_sentence(line, run) -> None:
 
 
 def test_each_file_has_its_page_and_the_summary_links_to_it(run, monkeypatch) -> None:
-    """With the search itself, of the smallest machine there is."""
+    """With the real search without candidates, on a machine with one coordinate."""
     from spindle import SPINDLE, spun
 
     import rotflex_jax as rf
@@ -127,7 +127,7 @@ def test_each_file_has_its_page_and_the_summary_links_to_it(run, monkeypatch) ->
     assert found.rows[0].verdict.replace("_", " ") in text.lower() and "shaft.inertia.inertia" in text
     assert f'href="pages/{page.name}"' in Path("each/summary.html").read_text()
     assert f'href="recordings/{page.stem}.json"' in Path("each/summary.html").read_text()
-    # Where a recording has none, its row leads to its numbers; a second call leaves a page where it is.
+    # A further call keeps an existing page. Without a page, the summary has no link to one.
     fleet(SPINDLE, [recording], **options)
     assert page.read_text() == text
     page.unlink()

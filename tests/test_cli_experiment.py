@@ -1,4 +1,4 @@
-"""`rotflex experiment`: one sentence on bad input, and a file that can be played."""
+"""`rotflex experiment`: bad input is refused with one sentence, and the input for the rig is written."""
 
 import json
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""`rotflex export`, models saved and taken up again, and one's own machine on the command line."""
+"""`rotflex export`, saved models, and machines from files of users on the command line."""
 
 import json
 import textwrap
@@ -17,7 +17,7 @@ from rotflex_jax.runtime import xla
 
 @pytest.fixture(autouse=True)
 def no_global_settings(monkeypatch):
-    """What the program sets up for its own process must not leak into the other tests."""
+    """Settings that the program makes for its process must not affect other tests."""
     monkeypatch.setattr(xla, "enable_fast_loops", lambda: True)
     monkeypatch.setattr(xla, "enable_compilation_cache", lambda: None)
 
@@ -103,7 +103,7 @@ def test_other_forms(run, saved):
 
 
 def test_simulators_with_their_certificates(run, saved, tmp_path):
-    """To a file, with the certificate on stdout; to stdout, with the certificate beside it."""
+    """With --out the certificate is printed on stdout; an export to stdout prints it on stderr."""
     target = tmp_path / "joint.xml"
     status, out, err = run("export", saved, "--to", "mjcf", "--out", target)
     assert (status, err) == (0, "") and out.startswith("Certificate of the export to MJCF")
@@ -134,7 +134,7 @@ def test_what_cannot_be_exported_is_said_in_one_sentence(run, saved, tmp_path):
 
 
 def test_a_machine_of_ones_own_from_a_file(run, plant, tmp_path):
-    """Named on the command line, its channels are read from the file by their own names."""
+    """A mechanism in a Python file is named on the command line; its channels are read by their names."""
     from rotflex_jax.joints.by_name import named
 
     u = 2 * np.sin(np.arange(800) * 0.02) + 0.3

@@ -1,6 +1,6 @@
-"""A walk through the first hour: files as people have them, commands as they type them, and what comes of it.
+"""Recordings in the file formats of users, and typical commands with mistakes.
 
-A refusal names its cure, and the cure works where it is followed.
+A message that names an option as the remedy is tested with that option: the file is then accepted.
 """
 
 import json
@@ -53,7 +53,7 @@ def matlab(**variables: object) -> Callable[[Path], Path]:
 
 
 def in_the_room(folder: Path) -> Path:
-    """Longer than the others: four seconds have too little slow motion to tell."""
+    """Absolute angles of the arm over 6 s, since 4 s contain too little slow motion to detect them."""
     whole = demo_recording().slice(0, 3000)
     columns = {"t": whole.t, "voltage": whole.u, "theta": whole.y[:, 0], "alpha": whole.y.sum(axis=1)}
     return as_csv(pd.DataFrame(columns))(folder)
@@ -66,7 +66,7 @@ def npz(folder: Path) -> Path:
 
 
 def simulink(folder: Path) -> Path:
-    """A scope's structure with time: each signal an entry of its own."""
+    """A structure with time, as a Simulink scope saves it: one entry for each signal."""
     signals = np.zeros(3, dtype=[("values", object), ("label", object)])
     for k, x in enumerate((U, THETA, ALPHA)):
         signals[k] = (x[:, None], NAMES[k + 1])
@@ -110,7 +110,7 @@ MATRIX = np.column_stack([T, U, THETA, ALPHA])
 
 
 def samples(folder: Path) -> Path:
-    """Samples as a JSON file of a logger has them."""
+    """A JSON file with one object per sample, as loggers write it."""
     rows = [dict(zip(NAMES, row, strict=True)) for row in MATRIX.tolist()]
     return _saved(folder / "run.json", lambda f: f.write_text(json.dumps(rows)))
 
@@ -168,7 +168,7 @@ READ = {
         "",
     ),
 }  # fmt: skip
-"""File, options; the recording is the one that was written."""
+"""Case -> file, and options with which all of its samples are read."""
 
 CURED = {
     "degrees": (as_csv(table(theta=np.rad2deg(THETA), alpha=np.rad2deg(ALPHA))), "degrees", "--degrees"),
@@ -182,7 +182,7 @@ CURED = {
     "the absolute angle of the arm": (in_the_room, "in the room", "--arm-absolute"),
     "some rows lost": (as_csv(table().drop(index=[700, 701, 1500])), "samples lost", "--resample auto"),
 }  # fmt: skip
-"""File, what is said of it, the option that is named and works."""
+"""Case -> file, words of the refusal, and the option that the message names and that works."""
 
 REFUSED = {
     "a hole": (as_csv(table(theta=holed)), "check", "theta"),
@@ -211,7 +211,7 @@ REFUSED = {
     "too short": (as_csv(table().head(30)), "check", "50 samples"),
     "an unknown command": (as_csv(table()), "dicsover", "dicsover"),
 }  # fmt: skip
-"""File, command, what the one sentence names."""
+"""Case -> file, command, and a word that the message must contain."""
 
 
 @pytest.mark.parametrize("case", READ)

@@ -1,4 +1,4 @@
-"""Methods side by side: the same data, nothing seen that is held out, a row for whatever goes wrong."""
+"""Comparison of methods: runs without held-out outputs, their errors, and failures as rows of the table."""
 
 import dataclasses
 import functools
@@ -35,7 +35,7 @@ def with_outputs(recording: Recording, y: np.ndarray) -> Recording:
 
 
 def scrambled(recording: Recording, start: int) -> Recording:
-    """Other outputs from sample `start` on."""
+    """The recording with random outputs from sample `start` on."""
     y = recording.y.copy()
     y[start:] = np.random.default_rng(0).normal(0.0, 0.3, y[start:].shape)
     return with_outputs(recording, y)
@@ -43,7 +43,7 @@ def scrambled(recording: Recording, start: int) -> Recording:
 
 @dataclasses.dataclass(frozen=True)
 class Told:
-    """A method that does what it is told."""
+    """A method whose fit and simulation are given as functions."""
 
     name: str
     run: Callable[[Recording], np.ndarray] | None = None
@@ -107,7 +107,7 @@ def test_no_method_uses_what_it_may_not_look_at(name: str, table: Comparison) ->
     y_hat = simulator.simulate(test)
     np.testing.assert_array_equal(simulator.simulate(scrambled(test, test.n_init)), y_hat)
     np.testing.assert_array_equal(table[name].simulated[0], y_hat)
-    # What it may look at does matter, or the line above would say nothing.
+    # Samples that it may use change its run; otherwise the comparison above would prove nothing.
     assert not np.allclose(simulator.simulate(scrambled(test, test.n_init // 2)), y_hat)
 
 
@@ -120,11 +120,12 @@ def test_errors_are_those_of_the_metrics_on_the_same_free_run(table: Comparison)
 
 
 def test_windows_start_anew() -> None:
+    """Errors over windows are those of free runs that start again in each window."""
     table = rf.compare(recorded(7.0), ["textbook"], window_seconds=1.0)
     (test,), row = table.test, table["textbook"]
     assert (test.N, test.n_init) == (1050, 100)
     model = Model(rf.joints.paper())
-    # The rest of 0.1 s joins the second window; each tells its first state by itself.
+    # The last 0.1 s belong to the second window. First states are estimated in each window separately.
     windowed = [model.simulate(test.slice(i, j)) for i, j in ((0, 500), (500, 1050))]
     judged = np.r_[100:500, 600:1050]
     expected = np.sqrt(np.mean((np.concatenate(windowed) - test.y)[judged] ** 2, axis=0))
@@ -133,7 +134,10 @@ def test_windows_start_anew() -> None:
 
 
 def test_a_window_has_the_voltage_of_the_whole_recording() -> None:
-    """The plant is the bare joint under a voltage shifted by hand; a model with that delay is exact."""
+    """The plant is a joint whose voltage the test shifts by 25 samples; its outputs have noise of 0.1 mrad.
+
+    Windowed runs of a model with this delay reach the noise.
+    """
     Ts, late, noise = 0.004, 25, 1e-4
     rng, parts = np.random.default_rng(3), []
     for N in (1500, 1500):
@@ -146,13 +150,17 @@ def test_a_window_has_the_voltage_of_the_whole_recording() -> None:
     for channel, error in row.rmse_windows.items():
         assert error < 2 * noise, channel
         assert max(row.horizon.rmse[channel]) < 3 * noise, channel
-    # As in a search: the same runs of the same model give the same number.
+    # The same error as in a search, which uses `simulate_windows` of the model.
     run = Model(joint).simulate_windows(test, 1.0)
     short = rf.metrics.windowed_rmse([test], [test.y], [run], 1.0)
     assert list(row.rmse_windows.values()) == pytest.approx(short.tolist())
 
 
 def test_windows_are_blind_and_those_of_a_black_box_recordings_by_themselves() -> None:
+    """A simulator gets only the first `n_init` outputs of each window.
+
+    One without `simulate_windows` gets each window as a separate recording.
+    """
     test, shown = recorded(2.0), []
 
     def run(recording: Recording, seconds: float | None = None) -> np.ndarray:
@@ -267,7 +275,7 @@ def test_discovered_chooses_within_the_training_data(monkeypatch: pytest.MonkeyP
 
 @pytest.mark.slow
 def test_discovered_finds_what_the_grey_box_lacks(monkeypatch) -> None:
-    # Among a few effects: that a search finds the right one among all is shown with the search.
+    # Four candidates only: tests of the search itself use all candidates.
     fx = rf.effects
     pairs = [
         (fx.Coulomb, "hub"),
@@ -293,7 +301,7 @@ def test_least_squares_finds_the_equation_behind_clean_data() -> None:
     )
     u, wind = np.random.default_rng(0).normal(size=(2, 400))
     blank = Recording(u=u, y=np.zeros((400, 2)), Ts=0.01, accept=("constant",), signals={"wind": wind})
-    m = blank.n_init  # up to there the run is not the equation's own
+    m = blank.n_init  # the samples before are measured, not computed by the equation
     record = Recording(u=u[m:], y=truth.simulate(blank)[m:], Ts=0.01, signals={"wind": wind[m:]})
     found = fit_difference_equation([record], 2)
     np.testing.assert_allclose(found.A, truth.A, atol=1e-10)

@@ -1,4 +1,4 @@
-"""Linear models from data: poles of known systems, pasts of series, choices within the training data."""
+"""Linear models and Volterra series from data, compared with systems simulated by scipy and numpy."""
 
 import dataclasses
 
@@ -25,7 +25,7 @@ def quiet(text: str) -> None:
 
 
 def driven(seconds: float = 20.0, noise: float = 0.01, seed: int = 0, integrates: bool = False) -> Recording:
-    """Outputs of scipy's filters: a resonance with a lag, and a lag, with noise of the sensors."""
+    """A recording of two filters of scipy, a resonance with a lag and a lag alone, with sensor noise."""
     rng = np.random.default_rng(seed)
     u = np.repeat(rng.normal(size=round(seconds / Ts / 8)), 8)
     first = scipy.signal.lfilter([0.0, 0.01, 0.02], np.poly(POLES[:2]).real, u)
@@ -38,7 +38,7 @@ def driven(seconds: float = 20.0, noise: float = 0.01, seed: int = 0, integrates
 
 
 def driven_by_two(seconds: float = 20.0, noise: float = 0.01) -> Recording:
-    """The same system on a base that moves: from there to each output goes a filter of the same poles."""
+    """The system of `driven` on a moving base, which acts on each output by a filter with the same poles."""
     record, rng = driven(seconds, noise=0.0), np.random.default_rng(1)
     base = scipy.signal.lfilter([0.2], [1.0, -0.8], rng.normal(size=record.N))
     first = scipy.signal.lfilter([0.0, 0.03, -0.02], np.poly(POLES[:2]).real, base)
@@ -48,7 +48,7 @@ def driven_by_two(seconds: float = 20.0, noise: float = 0.01) -> Recording:
 
 
 def response(system: LinearSystem, frequencies: np.ndarray, column: int) -> np.ndarray:
-    """From one input to all outputs, from the matrices."""
+    """Frequency response from one input to all outputs, computed from the state-space matrices."""
     z, one = np.exp(1j * frequencies), np.eye(system.order)
     B, D = system.B[:, column], system.D[:, column]
     return np.array([system.C @ np.linalg.solve(x * one - system.A, B) + D for x in z])
@@ -57,7 +57,7 @@ def response(system: LinearSystem, frequencies: np.ndarray, column: int) -> np.n
 @pytest.mark.parametrize("way", ["subspace", "fitted to free runs"])
 def test_a_signal_is_a_second_input(way: str) -> None:
     record = driven_by_two(noise=1e-6)
-    system = subspace([record], 20, (4,))[4]  # the lag has a state for each output: two inputs, two gains
+    system = subspace([record], 20, (4,))[4]  # with two inputs the lag needs two states
     if way != "subspace":
         system = refined(system, [record])
     assert system.signals == ("base [m/s^2]",)
@@ -99,12 +99,12 @@ def test_linear_methods_compare_with_the_signals_that_recordings_have() -> None:
 
 
 def test_parameters_of_a_linear_model_with_a_signal_are_counted_once() -> None:
-    """Two outputs, two inputs: the gains of each input, offsets, and what the modes have."""
+    """Models of order 4 with two inputs and two outputs; formulas for the counts stand at the assertions."""
     record, model = driven_by_two(), rf.Model(rf.joints.paper())
     of_subspace = Subspace(orders=(4,)).fit(model, [record], quiet)
-    assert of_subspace.parameters == 4 * (2 + 2) + 2 * 2 + 2  # n (C + m) + C m + C: in any coordinates
+    assert of_subspace.parameters == 4 * (2 + 2) + 2 * 2 + 2  # n (C + m) + C m + C, in any coordinates
     of_poles = LinearStateSpace(orders=(4,)).fit(model, [record], quiet)
-    assert of_poles.parameters == 4 * (2 * 2 + 1) + 2 * 2 + 2  # a pole, and a residue for each way through it
+    assert of_poles.parameters == 4 * (2 * 2 + 1) + 2 * 2 + 2  # n (C m + 1) + C m + C: poles and residues
 
 
 def test_the_subspace_method_finds_the_poles_that_scipy_simulated() -> None:
@@ -171,7 +171,7 @@ def test_products_are_those_of_the_basis() -> None:
 
 
 def volterra_plant(seed: int, integrates: bool = False, N: int = 3000, noise: float = 0.01) -> Recording:
-    """A plant that is a Volterra series of order 2 on steps of four samples, in numpy alone."""
+    """A recording of a Volterra series of order 2 in means over four samples, computed by numpy alone."""
     rng = np.random.default_rng(seed)
     u = np.repeat(rng.normal(size=N // 2), 2)
     past = np.concatenate([np.zeros(20), u])
@@ -188,7 +188,7 @@ def test_a_volterra_plant_is_found_with_its_memory(integrates: bool) -> None:
     fitted = BatchSeries("v", "v", count=3).fit(None, [train], quiet)  # type: ignore[arg-type]
     (channel,) = fitted.simulator.channels  # type: ignore[attr-defined]
     assert channel.integrates is integrates
-    # Widths are tried on a coarse grid; the one of the plant is among them only by luck.
+    # Widths are chosen from a coarse grid; the error is small only if it is the width of the plant, 4.
     part = test.slice(1000, 3000)
     e = (fitted.simulator.simulate(part) - part.y)[part.n_init :]
     assert np.sqrt(np.mean(e**2)) < (0.5 if channel.basis.bank.width != 4 else 0.05) * part.y.std()
@@ -208,7 +208,7 @@ def test_weights_and_past_of_a_series_are_those_of_the_plant() -> None:
     ):
         truth[name] = w
     np.testing.assert_allclose(series.weights, list(truth.values()), atol=0.02)
-    # From the middle of a motion, the first samples tell what the input was before.
+    # The part begins during a motion, so the input before it is estimated from its first samples.
     part = test.slice(1000, 1400)
     run = series.simulate(part.u, part.y[: part.n_init, 0])
     assert np.sqrt(np.mean((run - part.y[:, 0]) ** 2)) < 0.02 * part.y.std()

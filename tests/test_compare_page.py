@@ -1,4 +1,4 @@
-"""What a comparison tells: error by horizon and one step ahead, tables, figures, page, command line."""
+"""Output of a comparison: errors by horizon and one step ahead, tables, figures, page, command line."""
 
 import dataclasses
 import json
@@ -28,7 +28,7 @@ def recorded(N: int = 1200, seed: int = 0) -> Recording:
 
 @dataclasses.dataclass(frozen=True)
 class Drifts:
-    """Right but for an error that grows with the time since the first sample that was not seen."""
+    """A method whose free run has an error that grows with the time since the last sample it may use."""
 
     name: str
     slope: float
@@ -91,6 +91,7 @@ def test_a_free_run_cannot_look_ahead_at_any_horizon() -> None:
 
 
 def test_one_step_ahead_is_told_apart(table: Comparison) -> None:
+    """Errors of one-step predictions are reported beside those of free runs."""
     (test,), row = table.test, table["slow"]
     e = test.y[test.n_init :] - test.y[test.n_init - 1 : -1] - 0.01
     assert list(row.rmse_one_step.values()) == pytest.approx(np.sqrt(np.mean(e**2, axis=0)).tolist())
@@ -188,4 +189,4 @@ def test_of_a_fast_signal_only_so_many_swings_are_drawn() -> None:
     fast, slow = np.sin(2 * np.pi * 50 * t), np.sin(2 * np.pi * 0.5 * t)
     count = {name: drawn(Recording(u=y, y=y, Ts=1e-3)) for name, y in {"fast": fast, "slow": slow}.items()}
     assert count["slow"] == 5000
-    assert count["fast"] == pytest.approx(600, abs=20)  # sixty times through the mean
+    assert count["fast"] == pytest.approx(600, abs=20)  # sixty crossings of the mean

@@ -1,4 +1,4 @@
-"""Sparse laws of motion: a known equation, pysindy called directly, what happens without it, and the page."""
+"""SINDy against a known equation, pysindy called directly and scipy's integrator; SINDy without pysindy."""
 
 import builtins
 import dataclasses
@@ -25,7 +25,7 @@ LIMITS: dict[str, Any] = {
 
 
 def pendulum(seed: int = 0, seconds: float = 12.0, noise: float = 0.0) -> Recording:
-    """q'' = -9 q - 0.4 q' - 2 q^3 + 3 u, by scipy; the input is held."""
+    """A recording of q'' = -9 q - 0.4 q' - 2 q^3 + 3 u with a held input, integrated by scipy."""
     rng = np.random.default_rng(seed)
     N = round(seconds / Ts)
     u = np.repeat(rng.normal(size=N // 20), 20)
@@ -90,7 +90,10 @@ def test_smoothing_gives_speed_and_acceleration(kind: tuple[str, float]) -> None
 
 @pytest.mark.parametrize("width", [9, 31])
 def test_the_input_is_seen_through_the_same_smoothing(width: int) -> None:
-    """One and two integrators under a held input: smoothed rates are the smoothed input to rounding."""
+    """For one and two integrators with a held input, smoothed derivatives equal the smoothed input.
+
+    With `savgol` they agree to rounding, with `spline` to a tenth.
+    """
     u = np.random.default_rng(3).normal(size=400)
     speed = np.concatenate([[0.0], np.cumsum(Ts * u)[:-1]])
     place = np.concatenate([[0.0], np.cumsum(Ts * speed + Ts**2 / 2 * u)[:-1]])
@@ -137,7 +140,10 @@ def test_motion_is_that_of_scipy() -> None:
 
 
 def test_an_input_that_runs_on_is_not_held() -> None:
-    """q'' = -9 q - 0.4 q' + 3 sin 5t, whose input turns a tenth of a turn from sample to sample."""
+    """q'' = -9 q - 0.4 q' + 3 sin 5t, with 0.5 rad of the sine per sample, against scipy's integrator.
+
+    The error is below 1 % with a smooth input and above 10 % with a held input.
+    """
     step, N = 0.1, 120
     t = step * np.arange(N)
     law = lambda s, x: [x[1], -9 * x[0] - 0.4 * x[1] + 3 * np.sin(5 * s)]  # noqa: E731

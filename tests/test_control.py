@@ -1,4 +1,4 @@
-"""Controllers: gains beside python-control, loops beside a second simulation, C beside Python; a machine."""
+"""Controllers: gains against python-control, loops against a second simulation, C code against Python."""
 
 import ctypes
 import dataclasses
@@ -24,19 +24,19 @@ from rotflex_jax.mechanism.linear import zero_order_hold
 TS = 0.002
 JOINT = rf.joints.paper(hub_damping=0.004, joint_damping=0.003)
 RUBBED = JOINT + fx.Coulomb("hub", level=0.1)
-EXACT = 1e-9  # a sensor step that rounds nothing away [rad]
+EXACT = 1e-9  # a sensor step so small that rounding has no effect [rad]
 
 compiler = shutil.which("gcc") or shutil.which("cc")
 
 
 def swing(seconds: float = 2.0, still: float = 1.5) -> NDArray[np.float64]:
-    """A swing of 1 rad and back, and a rest [rad]."""
+    """A reference that moves to 1 rad and back, and then rests [rad]."""
     t = TS * np.arange(round(seconds / TS))
     return np.append(0.5 * (1 - np.cos(2 * np.pi * t / seconds)), np.zeros(round(still / TS)))
 
 
 class Linear:
-    """The linear part and a constant load at the hub, by a matrix exponential of its own."""
+    """A machine that is the linear part of the joint with a constant load, by a matrix exponential."""
 
     def __init__(self, load: float = 0.0, wobble: Callable[[int], float] | None = None):
         ss = rf.linearise(JOINT)
@@ -63,7 +63,7 @@ def test_the_gains_are_those_of_python_control():
     control = pytest.importorskip("control")
     found = rf.controller(JOINT, TS, accuracy=0.05, limit=6.0)
     plant = rf.export.state_space(JOINT, TS)
-    Q = np.diag([2.0, 1.0, 0.0, 0.0]) / 0.05**2  # the hub twice: as the port, and as a coordinate
+    Q = np.diag([2.0, 1.0, 0.0, 0.0]) / 0.05**2  # theta counts twice: as the port, and as a coordinate
     K, _, poles = control.dlqr(plant.A, plant.B, Q, np.array([[1 / 6.0**2]]))
     np.testing.assert_allclose(found.K[:4], K[0], rtol=1e-6)
     np.testing.assert_allclose(np.sort_complex(np.exp(found.poles * TS)), np.sort_complex(poles), rtol=1e-6)
@@ -92,7 +92,7 @@ def test_the_observer_is_stable_and_a_steady_kalman_filter():
     Q[4, 4] = (design.LOAD_PER_SECOND * stall) ** 2 * TS
     R = np.eye(2) * design.ENCODER**2 / 12
     expected, _, _ = control.dlqe(found.A, np.eye(5), found.C, Q, R)
-    # python-control corrects the next state, the controller the present one.
+    # The gain of python-control corrects the next state, the controller's gain the present one.
     np.testing.assert_allclose(found.A @ found.L, expected, rtol=1e-4, atol=1e-6)
 
 
@@ -101,7 +101,7 @@ def _hub_torque() -> NDArray[np.float64]:
 
 
 def _white(port: str) -> NDArray[np.float64]:
-    """Covariance of a white torque over a sample, as a sum over many small steps."""
+    """Covariance of the state after one sample of a white torque, as a sum over many small steps."""
     A = rf.linearise(JOINT).A
     b = np.append(np.zeros(2), rf.mechanism.linear.inverse_mass(JOINT) @ np.array(JOINT.port_vectors[port]))
     steps = 400
@@ -141,14 +141,17 @@ def test_a_planned_voltage_alone_moves_the_model_along_the_reference(port):
 
 
 def test_a_tracked_motion_is_the_best_one():
-    """Beside the dense least squares of the same sum; the end has nothing to follow, so it ends for both."""
+    """The reference is the dense least-squares solution of the same cost.
+
+    Reference and disturbance end long before the horizon, so the finite horizon makes no difference.
+    """
     A, B = np.array([[1.0, 0.1], [-0.2, 0.9]]), np.array([0.005, 0.1])
     c, effort, N = np.array([1.0, 0.0]), 1e-2, 300
     rng = np.random.default_rng(5)
     r, pushes = np.zeros(N), np.zeros((N, 2))
     r[20:100], pushes[10:120] = 1.0, 0.1 * rng.normal(size=(110, 2))
     X, u = Tracking(A, B, c, effort).solve(r, pushes)
-    # c x_k = sum over j < k of c A^(k-1-j) B u_j, and what the pushes make of a state at rest.
+    # c x_k = sum over j < k of c A^(k-1-j) B u_j, and the response to the pushes from rest.
     response, free, b, x = np.zeros(N), np.zeros(N), B, np.zeros(2)
     for k in range(N):
         free[k], x = c @ x, A @ x + pushes[k]
@@ -161,7 +164,10 @@ def test_a_tracked_motion_is_the_best_one():
 
 
 def test_the_plan_with_friction_moves_the_model_that_has_it():
-    """Without feedback: friction is an integrator's error, so the plan must be right at every reversal."""
+    """Without feedback, errors of the friction torque accumulate, so the plan must be right at each reversal.
+
+    Its tracking error is below 5 % of that of a plan without friction.
+    """
     wanted = swing(still=0.0)
     with_it = rf.simulate(RUBBED, rf.controller(RUBBED, TS).plan(wanted).voltage, TS)[:, 0]
     without = rf.simulate(RUBBED, rf.controller(RUBBED, TS, compensate="nothing").plan(wanted).voltage, TS)[
@@ -178,7 +184,7 @@ def test_torques_along_a_motion_are_those_of_the_laws():
     tau = torques_along(model, X, np.zeros(50), AT_REST * 1e-3, TS)
     ports = rf.mechanism.assembly.Layout.of(model.mechanism.structure).torque_ports
     friction = -0.1 * np.sign(X[:, 2])
-    friction[20] *= 0.25  # slow: nothing is to move, so most of it holds by itself
+    friction[20] *= 0.25  # below the speed of rest, friction decreases linearly
     np.testing.assert_allclose(tau[:, ports.index("hub")], friction, atol=1e-15)
     np.testing.assert_allclose(tau[:, ports.index("joint")], -60.0 * X[:, 1] ** 3, atol=1e-15)
 
@@ -188,7 +194,7 @@ def test_torques_along_a_motion_are_those_of_the_laws():
 
 def test_a_loop_with_a_model_is_the_loop_with_a_machine_of_its_equations():
     found = rf.controller(JOINT, TS, resolution=EXACT)
-    wanted = swing() + 0.2  # the machine begins elsewhere: the feedback has work to do
+    wanted = swing() + 0.2  # the machine starts 0.2 rad away, so that the feedback acts
     motion = found.plan(wanted)
     start = dataclasses.replace(motion, states=np.zeros_like(motion.states))
     model, machine = run_loop(found, JOINT, start), run_loop(found, Linear(), motion)
@@ -205,7 +211,7 @@ def test_the_observed_load_is_the_one_that_acts(compensate):
     assert run.load[-1] == pytest.approx(load, rel=0.02)
     if compensate == "observer":
         assert abs(run.error[-1]) < 1e-4
-    else:  # the spring of the feedback holds it: K x = -u, u = -load / torque per volt
+    else:  # the feedback balances it by an error: K x = -u, u = -load / torque per volt
         ss = rf.linearise(JOINT)
         volts = load / (ss.B[2] / _hub_torque()[2])
         assert run.error[-1] == pytest.approx(-volts / found.K[0], rel=0.02)
@@ -245,14 +251,13 @@ def test_a_limit_cycle_is_told_with_its_size_and_frequency(decay, drift, found):
 
 
 def test_the_assessment_names_the_model_that_breaks_the_loop():
-    """A delay of seven samples turns the phase of this loop by more than it bears."""
+    """A delay of seven samples exceeds the phase margin of this loop; half a sample does not break it."""
     found = rf.controller(JOINT, TS)
     late = JOINT + fx.Delay(time=0.014)
     report = rf.assess(found, {"as designed": JOINT, "late": late}, swing(still=0.0), hold=3.0)
     assert list(report.broken) == ["late"] and report.worst == "late"
     assert "late: limit cycle" in report.sentence and "held" in str(report)
     assert report.to_dict()["runs"]["as designed"]["limit_cycle"] is None
-    # A small delay is simulated too, and held.
     assert rf.assess(found, [JOINT + fx.Delay(time=0.001)], swing(still=0.0), hold=3.0).broken == {}
 
 
@@ -300,7 +305,7 @@ def test_the_c_code_gives_the_same_voltage(tmp_path):
     as_double = lambda a: a.ctypes.data_as(ctypes.POINTER(ctypes.c_double))  # noqa: E731
     library.drive(ctypes.c_int(len(wanted)), as_double(y), as_double(u))
     np.testing.assert_allclose(u, run.voltage, atol=1e-9)
-    assert run.saturated > 0  # so that the limit was part of it
+    assert run.saturated > 0  # the limit was reached, so it is part of the comparison
 
 
 @pytest.mark.parametrize(("options", "prefix"), [(["--prefix", "arm"], "arm"), ([], "control")])
@@ -315,7 +320,10 @@ def test_the_command_line_writes_it(capsys, options, prefix):
 
 
 def test_a_machine_that_was_identified_is_held_and_the_found_friction_is_compensated():
-    """Fitted to a recording of the simulator in `benchmarks/arena`; the truth enters nowhere."""
+    """The controller follows from a fit to a recording of an independent simulator, without true parameters.
+
+    With friction compensation, the tracking error on this simulator is at most half.
+    """
     from rotflex_jax.arena.simulator.machine import Machine
     from rotflex_jax.arena.simulator.records import make_record
 
@@ -356,7 +364,7 @@ def test_models_are_drawn_from_the_distribution_of_the_fit():
 
 
 def test_names_become_no_code():
-    """A name that ends the comment and goes on as C stays in the comment."""
+    """A name that contains the end of a C comment and a directive stays inside the comment."""
     name = "a */ #error b /*"
     motor = [fx.Motor(at="hub", gear_ratio=5.0), fx.Inertia(at="hub", inertia=0.01), fx.Viscous(at="hub")]
     machine = rf.Mechanism(coordinates=[name], ports={"hub": (1,)}, effects=motor, outputs={name: "hub"})

@@ -1,4 +1,4 @@
-"""Damaged, hostile and merely odd files: read, or refused with one sentence; never anything else."""
+"""Damaged, hostile and unusual files: each is either read or refused with one sentence."""
 
 import contextlib
 import io
@@ -87,7 +87,7 @@ def test_mat_file_is_read_as_scipy_reads_it(how: dict[str, Any], tmp_path: Path)
     path.write_bytes(mat(RICH, **how))
     expected = scipy.io.loadmat(path, simplify_cells=True)
     found = read_mat(path)
-    assert set(RICH) - set(found) == {"sparse"}  # which is no signal
+    assert set(RICH) - set(found) == {"sparse"}  # a sparse matrix is no signal
     for name, value in found.items():
         assert alike(value, expected[name]), name
 
@@ -154,7 +154,7 @@ def test_two_variables_of_one_name_are_refused(tmp_path: Path) -> None:
 
 def npz(parts: dict[str, bytes], how: int = zipfile.ZIP_DEFLATED) -> bytes:
     with zipfile.ZipFile(out := io.BytesIO(), "w", how) as archive, warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of two names that are equal
+        warnings.simplefilter("ignore")  # about two equal names
         for name, data in parts.items():
             archive.writestr(name, data)
     return out.getvalue()
@@ -170,7 +170,7 @@ ZEROS = {"t": np.zeros(500_000)}
 
 def zeros_hdf5(path: Path) -> None:
     with h5py.File(path, "w") as file:
-        file.create_dataset("t", shape=(10**12,), dtype="f8", chunks=(1000,))  # nothing of it is stored
+        file.create_dataset("t", shape=(10**12,), dtype="f8", chunks=(1000,))  # no value is stored
 
 
 def block_hdf5(path: Path) -> None:
@@ -210,7 +210,7 @@ GOOD_NPY = npy(CLAIMED.format("(60,)"), RUN["t"].tobytes())
 
 
 def flagged(data: bytes, flag: int) -> bytes:
-    """With a flag in both headers of the first part."""
+    """The archive with a flag set in both headers of its first part."""
     found = bytearray(data)
     found[6] |= flag
     found[data.index(b"PK\1\2") + 8] |= flag
@@ -258,7 +258,7 @@ def hdf5(path: Path, edit: Callable[[Any], object]) -> Path:
 
 
 def empty(file: Any) -> None:
-    file["nothing"] = np.zeros(2, dtype=np.uint64)  # the sizes
+    file["nothing"] = np.zeros(2, dtype=np.uint64)  # the shape of the empty array
     file["nothing"].attrs["MATLAB_empty"] = np.uint8(1)
 
 
@@ -520,7 +520,7 @@ def test_file_is_written_through_a_link_and_into_a_device(tmp_path: Path) -> Non
     )
 
 
-# -- at random ------------------------------------------------------------------------------------------
+# -- random changes ------------------------------------------------------------------------------------------
 
 
 def test_changed_files_are_read_or_refused() -> None:

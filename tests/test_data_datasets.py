@@ -72,7 +72,7 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def serve(monkeypatch: pytest.MonkeyPatch, content: Callable[[str], bytes]) -> list[str]:
-    """Puts a web in place of the real one; pooch itself, with its cache and check, stays."""
+    """Replace the download in pooch, but not its cache and hash check; the requested URLs are returned."""
     asked: list[str] = []
 
     def downloader(url: str, output_file: str, pooch: object) -> None:
@@ -130,7 +130,7 @@ def test_rotflex_is_the_joint_in_radians(measured: Measured) -> None:
         )
         np.testing.assert_allclose(by_columns.y, recording.y, atol=1e-15)
         np.testing.assert_array_equal(by_columns.u, recording.u)
-    # At rest with the voltage that dry friction holds.
+    # Largest angle of the first run, largest voltage of the second.
     assert np.rad2deg(first.y[:, 0].max()) == pytest.approx(29.18, abs=0.01)
     assert np.max(np.abs(second.u)) == pytest.approx(5.009, abs=0.001)
 
@@ -168,7 +168,7 @@ def test_rotary_arm_is_in_seconds_and_radians(measured: Measured) -> None:
     flexible, *rigid = measured("rotary_arm")
     assert flexible.channels == ("theta", "alpha")
     assert np.max(np.abs(flexible.y[:, 1])) < 1.0
-    # The arm falls behind the hub when a step of the voltage sets that in motion.
+    # The arm lags behind the hub when a step of the voltage sets the hub in motion.
     steps = np.flatnonzero(np.abs(np.diff(flexible.u)) > 0.5)
     assert len(steps) == 2
     for k in steps:

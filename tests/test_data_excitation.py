@@ -1,4 +1,4 @@
-"""Inputs against what their definitions say: variance, spectrum, levels, times."""
+"""Input signals against their definitions: variance, spectrum, levels, times."""
 
 import numpy as np
 import pytest

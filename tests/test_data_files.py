@@ -1,4 +1,4 @@
-"""The same run from every kind of file."""
+"""Every kind of file gives the same recording."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -146,10 +146,10 @@ def test_signals_are_columns_too(tmp_path: Path) -> None:
     assert list(load(path, signals={"second motor [A]": "i2"}).signals) == ["second motor [A]"]
     for none in (None, [], {}):
         assert load(path, signals=none).signals == {}
-    # In the unit that they have, also where the outputs are in degrees.
+    # Signals keep their unit; degrees are not converted.
     frame = pd.DataFrame(COLUMNS | {"tilt [deg]": PUSH})
     np.testing.assert_array_equal(load(frame, signals="tilt").signals["tilt [deg]"], PUSH)
-    # With the unit from the line of units below the header.
+    # The unit may come from a line of units below the header.
     header = "t,voltage,theta,alpha,push\ns,V,rad,rad,N"
     other = write_text(tmp_path / "units.csv", header, table=table[:, :5])
     assert list(load(other, signals="push").signals) == ["push [N]"]
@@ -177,7 +177,7 @@ def test_columns_that_are_no_signals_are_refused(signals: Any, phrase: str) -> N
 
 
 def test_signals_are_held_where_times_are_uneven() -> None:
-    """As the input is, while outputs follow straight lines."""
+    """With `resample`, signals are held like the input; only outputs are interpolated."""
     uneven = T + np.where(np.arange(N) % 2, 0.4 * Ts, 0.0)  # odd samples come late
     frame = pd.DataFrame(COLUMNS | {"t": uneven, "push": PUSH})
     recording = load(frame, signals="push", resample=Ts)
@@ -190,7 +190,7 @@ def test_signals_in_files_of_their_own(tmp_path: Path) -> None:
     for name, values in COLUMNS.items():
         if name != "t":
             pd.DataFrame({"t": T, name: values}).to_csv(tmp_path / f"{name}.csv", index=False)
-    # Twice as slow, and a sample late.
+    # Half the sampling rate, and one sample late.
     pd.DataFrame({"t": T[::2] + Ts, "push": PUSH[::2]}).to_csv(tmp_path / "push.csv", index=False)
     with pytest.raises(InputError, match=r"'push'.* have times of their own"):
         load(tmp_path, signals="push")
@@ -198,7 +198,7 @@ def test_signals_in_files_of_their_own(tmp_path: Path) -> None:
     assert recording.start == pytest.approx(Ts)
     np.testing.assert_array_equal(recording.signals["push"], np.repeat(PUSH[::2], 2)[: recording.N])
     np.testing.assert_allclose(recording.y, Y[1:][: recording.N], atol=1e-12)
-    assert load(tmp_path).signals == {}  # what is not named needs no common times
+    assert load(tmp_path).signals == {}  # columns that are not named need no common times
 
 
 def test_degrees_become_radians(tmp_path: Path) -> None:
@@ -236,7 +236,10 @@ def test_matrices_and_structures_have_columns(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("write", [scipy.io.savemat, write_hdf5])
 def test_signals_in_rows_are_signals(write: Callable, tmp_path: Path) -> None:
-    """As Simulink's block To File writes them; a matrix of fewer than 50 rows can hold no recording else."""
+    """Simulink's block To File writes signals as rows.
+
+    A matrix with fewer than 50 rows is transposed, since a recording has at least 50 samples.
+    """
     write(tmp_path / "run.mat", {"ans": TABLE.T})
     outputs = ("ans[2]", "ans[3]")
     assert_is_the_run(load(tmp_path / "run.mat", time="ans[0]", input="ans[1]", outputs=outputs))
@@ -251,7 +254,7 @@ def test_line_of_units_is_read(units: str, tmp_path: Path) -> None:
 
 
 def test_matrix_of_matlab_7_3_is_not_transposed(tmp_path: Path) -> None:
-    # HDF5 sees what MATLAB stores column by column with its axes exchanged.
+    # MATLAB stores arrays column by column, so their axes are exchanged in HDF5.
     write_hdf5(tmp_path / "run.mat", {"log": TABLE.T})
     outputs = ("log[2]", "log[3]")
     assert_is_the_run(load(tmp_path / "run.mat", time="log[0]", input="log[1]", outputs=outputs))

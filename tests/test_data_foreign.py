@@ -1,4 +1,4 @@
-"""Recordings that other libraries hold, and public sets that are fetched by hand."""
+"""Recordings as objects of other libraries, and public datasets that are downloaded by hand."""
 
 import sys
 from types import ModuleType, SimpleNamespace
@@ -31,7 +31,7 @@ def test_the_objects_of_nonlinear_benchmarks():
         assert (recording.channels, recording.units) == (("position",), ("m",))
         assert (recording.Ts, recording.n_init, recording.source) == (0.01, 20, "test")
         np.testing.assert_array_equal(recording.y[:, 0], held.y)
-    # A slice forgets its name and protocol there.
+    # A slice of such an object loses its name and its initialisation length.
     assert rf.load(held[:100]).N == 100
 
 

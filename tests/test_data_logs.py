@@ -1,4 +1,4 @@
-"""Logs of LabVIEW, MDF4 and ROS 2, each written by its library, and of JSON; one file for each channel."""
+"""Logs of MATLAB, LabVIEW, MDF4 and ROS 2, written by other libraries; JSON; one file for each channel."""
 
 import io
 import json
@@ -94,7 +94,7 @@ def test_a_timetable_of_version_7_3_is_refused_with_its_cure(tmp_path):
 
 
 def test_a_damaged_timetable_is_left_out_and_named(tmp_path):
-    """The numbers of its properties are gone, the file around them is whole."""
+    """The name of a property of its times is overwritten; the rest of the file is intact."""
     pd = pytest.importorskip("pandas")
     path = timetable(tmp_path / "run.mat", pd.to_timedelta(2 * K, unit="ms"), also=np.arange(9.0))
     data = path.read_bytes()
@@ -116,13 +116,13 @@ def test_a_damaged_timetable_is_left_out_and_named(tmp_path):
 
 
 def timeseries(path: Path, wanted: dict, units: str = "seconds", implicit: bool = False) -> Path:
-    """A file of timeseries as MATLAB keeps them, written by another implementation of its objects."""
+    """A file of timeseries as MATLAB stores them, written by another implementation of its objects."""
     matio = pytest.importorskip("matio")
     from matio.utils import MatlabOpaque
 
     def one(t, x):
         about = {"Units": units}
-        if implicit:  # Simulink's: an even step and no times, and time along the last axis
+        if implicit:  # as of Simulink: a constant step instead of times, and time along the last axis
             x, step = x[None, None], float(t[1] - t[0])
             about |= {
                 "Start_": np.array([[t[0]]]),
@@ -166,14 +166,14 @@ def test_a_timeseries_without_its_step_is_left_out_and_named(tmp_path):
 def dataset(
     path: Path, names=tuple(SIGNALS), deep: bool = False, within: bool = False, again: int = 0
 ) -> Path:
-    """A file with a Simulink Dataset as another implementation of MATLAB's objects writes it.
+    """A file with a Simulink Dataset, written by another implementation of MATLAB's objects.
 
     Args:
-        path: Of the file.
-        names: Of the signals.
-        deep: Whether the signals stand in an object of the Dataset's own.
-        within: Whether the Dataset stands in an object with the outputs of a simulation.
-        again: How many objects, one in the other, lead to the Dataset twice each.
+        path: Path of the file.
+        names: Names of the signals.
+        deep: Whether the signals are in a separate object inside the Dataset.
+        within: Whether the Dataset is in an object with the outputs of a simulation.
+        again: Number of nested objects around the Dataset, each with two references to the next.
     """
     matio = pytest.importorskip("matio")
     from matio.utils import MatlabOpaque
@@ -213,7 +213,7 @@ def test_a_dataset_of_simulink_is_read_by_the_names_of_its_signals(tmp_path, dee
 
 @pytest.mark.parametrize("again", [1, 12])
 def test_a_signal_that_is_reached_twice_is_one_signal(tmp_path, again, monkeypatch):
-    """Twelve objects that lead twice each to the next are 4096 ways to each signal."""
+    """Twelve nested objects with two references each make 4096 paths, but fewer than 200 objects are read."""
     path = dataset(tmp_path / "run.mat", again=again)
     read, properties = [], StoredObjects.properties
 
@@ -278,7 +278,10 @@ def test_json_without_a_recording_is_refused(tmp_path, content, said):
 
 
 def test_a_log_of_a_servo_is_read_by_its_columns(measured):
-    """Its own reader is the reference; the goal is resampled otherwise there, along straight lines."""
+    """The reference for the angle is `load_bam_xl330`.
+
+    The goal is not compared, since that reader interpolates it linearly and `load` holds it.
+    """
     known = measured("bam_xl330")[0]
     path = Path(os.environ["ROTFLEX_DATA"]) / "bam_xl330" / known.source.split(",")[0]
     names = {"time": "timestamp", "input": "goal_position", "outputs": {"theta": "position"}}
@@ -363,7 +366,7 @@ def test_groups_with_times_of_their_own_are_brought_together_on_request(tmp_path
     recording = load(path, resample="auto", accept=("units", "swapped"))
     t = recording.t
     np.testing.assert_array_equal(t, 0.0007 + 0.002 * np.arange(len(t)))
-    # A ramp lies on its straight lines; the voltage is the one that was held then.
+    # Linear interpolation is exact for a ramp; the voltage is held between its samples.
     np.testing.assert_allclose(recording.y[:, 0], 5.0 * t, atol=1e-12)
     np.testing.assert_array_equal(recording.u, VOLTAGE[: len(t)])
     assert [finding.kind for finding in recording.findings if finding.kind == "resampled"] == ["resampled"]
@@ -423,12 +426,12 @@ def test_joint_states_at_uneven_times_are_resampled_on_request(tmp_path):
     refused(path, r"not uniform|uneven|resample", **NAMES)
     recording = load(path, resample=0.002, **NAMES)
     moved = np.interp(recording.t, T, THETA)
-    np.testing.assert_allclose(recording.y[:, 0], moved, atol=0.3 / 9 * 0.5)  # less than half a step away
+    np.testing.assert_allclose(recording.y[:, 0], moved, atol=0.3 / 9 * 0.5)  # half of the largest step
     assert len(recording.u) >= N - 2
 
 
 def test_simulated_time_begins_at_zero(tmp_path):
-    """A first stamp of zero is a time; only where all are zero did nobody fill them in."""
+    """A first stamp of zero is a time; stamps count as missing only if all of them are zero."""
     ros2 = pytest.importorskip("mcap_ros2.writer")
     writer = ros2.Writer(out := io.BytesIO())
     state = writer.register_msgdef("sensor_msgs/msg/JointState", JOINT_STATE)

@@ -1,4 +1,4 @@
-"""A slice of the benchmark B0: the search on recordings of the arena's independent simulator."""
+"""The search on recordings of an independent simulator: a few problems like those of benchmark B0."""
 
 import pytest
 
@@ -11,8 +11,8 @@ from rotflex_jax.discover import Discovery
 
 pytestmark = pytest.mark.slow
 
-# Neither the tuning seeds (100 to 119) nor the report seeds (1000 to 1019) of the benchmark.
-# As long as what other tests search (3500 samples), with which these share what is compiled.
+# The seeds below are neither the tuning seeds (100 to 119) nor the report seeds (1000 to 1019) of B0. The
+# recordings have as many samples (3500) as those of other searches, so that they share compiled programs.
 SECONDS, FS = 7.0, 500.0
 
 
@@ -34,11 +34,11 @@ def test_finds_the_hidden_effect(place: Place, kind: str, seed: int, tolerance: 
     result, truth = searched(place, kind, seed)
     rounds = [(r.effect, r.port) for r in result.rounds]
     assert rounds[0] == place
-    # Anything beside it may only be what no recording can tell from it.
+    # Other effects may only be documented equivalents of it.
     assert set(rounds) <= alike(place)
     assert result.verdict in ("found", "ambiguous")
 
-    # What is reported is the most probable set, and the right effect is in nearly all that could be.
+    # The reported set is the most probable one, and the true effect has a probability above 0.9.
     probable = result.probabilities
     assert probable.sets[0].effects == {f"{e}@{p}" for e, p in rounds}
     assert probable.effects[f"{place[0]}@{place[1]}"] > 0.9
@@ -53,31 +53,31 @@ def test_finds_the_hidden_effect(place: Place, kind: str, seed: int, tolerance: 
 
     before, after = result.baseline.held_out_rmse_windows, result.final.held_out_rmse_windows
     assert all(after[c] < before[c] for c in before)
-    # As good as the sensor allows.
+    # Errors are near the noise of the sensor.
     assert all(after[c] < 1.2 * result.noise_floor[c] for c in after)
 
 
 def test_an_asymmetric_friction_is_one_law() -> None:
-    """A calibration would take its asymmetry away, and the answer would have two effects."""
+    """It is found as one effect, not as symmetric friction beside a calibration of the voltage offset."""
     record = make_record([("coulomb_asymmetric", "hub")], seed=2004, seconds=6.0, fs=FS)
     train, test = rf.Recording(u=record["u"], y=record["y"], Ts=record["Ts"]).split(0.7)
     pairs = [(fx.Coulomb, "hub"), (fx.CoulombAsymmetric, "hub")]
     result = rf.discover(rf.joints.paper(), train, test, candidates=pairs)
     (found,) = result.rounds
-    # Both ways to write it were fitted; the one with fewer effects is the more probable one.
+    # Both sets were fitted; the set with fewer effects is more probable.
     probable = dict(result.probabilities.sets)
     one, several = frozenset({"coulomb_asymmetric@hub"}), frozenset({"coulomb@hub", "voltage_offset@input"})
     assert result.probabilities.sets[0].effects == one
     assert probable[one] > probable[several] > 0
     assert (found.effect, found.port) == ("coulomb_asymmetric", "hub")
-    # A voltage offset does the same with as many numbers.
+    # Coulomb friction with a voltage offset has the same effect and as many parameters.
     assert set(found.equivalent) == {("coulomb", "hub"), ("voltage_offset", "input")}
     assert found.parameters["forward"].value == pytest.approx(0.045, rel=0.03)
     assert found.parameters["backward"].value == pytest.approx(0.015, rel=0.06)
 
 
 def test_hysteresis_takes_the_place_of_the_friction_it_contains() -> None:
-    """Dahl friction comes first to first order, and its slope says little of what is missing then."""
+    """The score test ranks Dahl friction first; the result has Bouc-Wen hysteresis, which contains it."""
     record = make_record([("bouc_wen", "hub")], seed=2005, seconds=6.0, fs=FS)
     train, test = rf.Recording(u=record["u"], y=record["y"], Ts=record["Ts"]).split(0.7)
     result = rf.discover(rf.joints.paper(), train, test, candidates=[(fx.Dahl, "hub"), (fx.BoucWen, "hub")])
@@ -102,7 +102,7 @@ def test_scoring_knows_look_alikes() -> None:
     assert not mark["strict"] and not mark["extra"]
     # The symmetric part alone is not the truth.
     assert not scored([lopsided], [hub], [[]], "found")["exact"]
-    # A set that holds the truth is an honest answer only if it is called ambiguous.
+    # A set of equivalents that contains the true effect is right only with the verdict ambiguous.
     wrong = ("stribeck", "hub")
     assert scored([hub], [wrong], [[hub]], "ambiguous")["verdict_right"]
     assert not scored([hub], [wrong], [[hub]], "found")["verdict_right"]

@@ -18,7 +18,7 @@ def arm(
 
         J w' = c (u + offset) - b w - friction
 
-    in explicit steps of 0.1 ms, with friction that holds; the encoder has steps of 0.5 mrad.
+    in explicit steps of 0.1 ms, with static friction; the encoder has steps of 0.5 mrad.
     """
     rng, h = np.random.default_rng(seed), Ts / fine
     reference = step * np.repeat([0, 1, -1, 1], N // 4)
@@ -47,7 +47,7 @@ def test_a_baseline_that_does_not_move_hides_no_friction() -> None:
     found = rf.discover(
         model, train, validation, test=test, candidates=[(Coulomb, "hub"), (Cogging, "hub")], rounds=1
     )
-    # Otherwise this would be a test of something else.
+    # The baseline must be in the minimum that is tested, with an inertia so large that nothing moves.
     inertia = "hub.inertia.inertia"
     assert values(found.baseline.model)[inertia] > 100 * values(model)[inertia]
     assert [note for note in found.notes if inertia in note and "rest" in note]

@@ -1,4 +1,4 @@
-"""Bands of a search's result: which model they are around, and what is not known of a recording's run."""
+"""Bands of a search's result: the model in their middle, and the uncertainty of the offset of a run."""
 
 import dataclasses
 import functools
@@ -43,8 +43,8 @@ def searched(
     """A search that ends unexplained, with the final fit of the axis and an offset of the voltage.
 
     Args:
-        train: Recordings.
-        validation: Recordings; these and those are fitted.
+        train: Training recordings.
+        validation: Validation recordings; the fit is to both.
         carried: Offset of the model to use; None if it has no such effect.
     """
     runs = joined([*train, *validation])
@@ -52,7 +52,7 @@ def searched(
     m = fit.model.mechanism
     m = m.without("voltage_offset", "input") if carried is None else m.with_values({OFFSET: carried})
     model = dataclasses.replace(fit.model, mechanism=m)
-    # As where runs have something in common: the interval is by how they differ, the covariance stays.
+    # As for offsets with a common part: the interval follows from their scatter, the covariance stays.
     apart = [dataclasses.replace(e, std=0.07) if e.name == OFFSET else e for e in fit.parameters]
     fit = dataclasses.replace(fit, parameters=tuple(apart))
     result = SimpleNamespace(
@@ -73,7 +73,7 @@ def bands(result: SimpleNamespace, recording: rf.Recording, **known: rf.Recordin
 
 
 def per_volt(recording: rf.Recording) -> np.ndarray:
-    """How an offset of 1 V moves the angle, less what the first state takes away again [rad/V]."""
+    """Change of the angle by an offset of 1 V, less the part that a fitted first state removes [rad/V]."""
     t = TS * np.arange(N)
     X, moved = np.column_stack([np.ones(N), t]), TORQUE_PER_VOLT * t**2 / 2
     head = slice(0, recording.n_init)
@@ -81,12 +81,15 @@ def per_volt(recording: rf.Recording) -> np.ndarray:
 
 
 def test_an_unknown_run_has_an_offset_about_as_far_off_as_those_of_fitted_runs():
-    """About the value in the model, which is not the mean of those."""
+    """The standard deviation of its offset is that of the fitted offsets about the value in the model.
+
+    This value is not their mean.
+    """
     other = run(7, 0.4)
     result = searched([run(1, 0.1)], [run(2, 0.3)], carried=0.15)
     found = bands(result, other)
     np.testing.assert_allclose(found.middle, result.model.simulate(other), atol=1e-9)
-    spread = np.sqrt(0.2**2 / 2 + (0.2 - 0.15) ** 2)  # variance of 0.1 and 0.3, and their mean less the value
+    spread = np.sqrt(0.2**2 / 2 + (0.2 - 0.15) ** 2)  # variance of 0.1 and 0.3, squared shift of their mean
     np.testing.assert_allclose(found.parts[OWN][:, 0], spread * per_volt(other), rtol=0.02, atol=1e-9)
 
 
@@ -96,14 +99,17 @@ def test_a_run_that_was_fitted_has_its_own_offset():
         found = bands(result, recording)
         fit = result.final_fit.fit
         i = fit.free_names.index(OFFSET)
-        more = np.sqrt(fit.local[OFFSET][1].std ** 2 - fit.covariance[i, i])  # than the mean has
+        more = np.sqrt(fit.local[OFFSET][1].std ** 2 - fit.covariance[i, i])  # than the variance of the mean
         np.testing.assert_allclose(found.parts[OWN][:, 0], more * per_volt(recording), rtol=0.02, atol=1e-9)
         np.testing.assert_allclose(found.middle, result.model_of(recording).simulate(recording), atol=1e-9)
     assert np.std(found.middle - recording.y) < 2 * NOISE
 
 
 def test_one_run_alone_says_how_large_an_offset_may_be():
-    """Without the offset in the model, zero is taken of another run."""
+    """The model has no offset, and the offset of the one fitted run is 0.2 V.
+
+    The band of another run is around zero offset, with a standard deviation of 0.2 V.
+    """
     whole, other = run(3, 0.2), run(7, -0.3)
     train, validation = whole.split(0.7)
     result = searched([train], [validation], carried=None)
@@ -113,6 +119,7 @@ def test_one_run_alone_says_how_large_an_offset_may_be():
 
 
 def test_whole_runs_that_were_fitted_say_what_the_final_fit_lacks():
+    """If the final fit is wrong, errors over the fitted runs widen its bands to the given probability."""
     result = searched([run(1, 0.1)], [run(2, 0.3)], carried=0.15)
     fit = result.final_fit.fit
     wrong = fit.model.mechanism.with_values({CONSTANT: 0.012})
@@ -140,11 +147,12 @@ def test_sets_do_not_give_another_run_the_offset_of_the_only_one():
     )
     same = bands_of_sets(result, [(fit, 1.0)], validation, 0.9, ())
     assert OWN not in same.parts and same.coverage()["theta"] > 0.8
-    result.validation = (other,)  # two runs were compared: the offset is the machine's
+    result.validation = (other,)  # two runs were compared, so the offset belongs to the machine
     assert OWN not in bands_of_sets(result, [(fit, 1.0)], run(8, 0.2), 0.9, ()).parts
 
 
 def test_validation_data_say_what_the_sets_of_an_unexplained_search_lack():
+    """If a set is wrong, errors over validation data widen its band, but only of an unexplained search."""
     train, validation = run(3, 0.2), run(4, 0.2)
     result, fit = searched([train], [validation], carried=0.2), one_set(train)
     wrong = dataclasses.replace(fit, model=rf.Model(fit.model.mechanism.with_values({CONSTANT: 0.012})))

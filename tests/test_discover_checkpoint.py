@@ -1,4 +1,4 @@
-"""A search that was stopped goes on from its finished rounds; what is said while a user waits."""
+"""A stopped search continues from its finished rounds; lines of progress and the time left."""
 
 import copy
 import json
@@ -22,7 +22,7 @@ from rotflex_jax.recording.recording import content
 
 @pytest.fixture(scope="module")
 def searched(tmp_path_factory: pytest.TempPathFactory) -> tuple[rf.Discovery, Path]:
-    """A search to its end, and what it would have left after its first round."""
+    """A finished search, and the file that it would have left if stopped after its first round."""
     folder = tmp_path_factory.mktemp("stopped")
     rounds, left = RoundsSoFar(folder / "found.json"), folder / "left.json"
 
@@ -46,7 +46,7 @@ def test_ends_as_if_it_had_not_been_stopped(searched: tuple[rf.Discovery, Path])
     assert again.rounds[0].score == whole.rounds[0].score
     assert again.rounds[0].prediction.gain == pytest.approx(whole.rounds[0].prediction.gain, rel=1e-3)
     assert [r.effect for r in again.ranking] == [r.effect for r in whole.ranking]
-    # Neither the baseline nor the first round is fitted once more, and the result says so.
+    # Neither the baseline nor the first round is fitted again, and a note states this.
     assert "fitting the model as it is" not in said and not any("round 1" in line for line in said)
     assert any("went on after one round" in note for note in again.notes)
     assert not any("went on" in note for note in whole.notes)
@@ -130,7 +130,7 @@ def test_option_of_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixtur
 
 
 def test_what_a_recording_continues_belongs_to_it() -> None:
-    """States that no sensor measures start where the part before ends, so a search there is another one."""
+    """Unmeasured states start where the part before ends, so this part identifies the recording as well."""
     _, later = spun().split(0.7)
     assert later.continues is not None
     alone = copy.copy(later)
@@ -148,7 +148,10 @@ def test_the_same_recordings_shared_out_otherwise_are_another_search() -> None:
 def test_nothing_is_reported_before_all_is_read(
     searched: tuple[rf.Discovery, Path],
 ) -> None:
-    """What it reports replaces the file that it goes on from: a second stop must not lose rounds."""
+    """A search that continues reports a round only once all rounds of the file are validated.
+
+    Its reports replace this file, and a second stop must not lose rounds.
+    """
     written = json.loads(searched[1].read_text())
     reached: list[int] = []
 
@@ -187,19 +190,19 @@ def test_the_time_left_is_that_of_the_steps_measured() -> None:
         left.follow(beginning(kind, kind))  # pyright: ignore[reportArgumentType]
         return left.seconds()
 
-    # The first steps compile; nobody knows how long.
+    # The first steps compile programs, which takes an unknown time.
     assert (left.seconds(), after(1, "baseline"), after(30, "score"), after(20, "refit")) == (None,) * 4
     assert left.words() == "51 s so far"
-    # 40 s of refits were measured. A second round if it is the last one: scores, refits, and two more steps
-    # of refits, for which nothing else is known yet.
+    # Refits took 40 s. If the second round is the last one, scores, refits and two steps of other kinds
+    # follow. These were not measured yet and are assumed to take as long as refits.
     assert after(40, "score") == 20 + 3 * 40
     clock.now += 15
     left.follow("  a line of no step")
     assert left.seconds() == 5 + 3 * 40
     assert left.words() == "106 s so far, about 2 min left if this round is the last"
-    clock.now += 100  # longer than the first time: then nobody knows
+    clock.now += 100  # longer than the first time: no estimate
     assert left.seconds() is None and left.words() == "206 s so far, longer than expected"
-    # The last measurement of each kind counts: it did not compile.
+    # The last measurement of each kind counts, since no program was compiled in it.
     assert after(0, "refit") == 3 * 40 and after(10, "needed") == 2 * 10
     assert after(4, "finish") == 10 and left.words().endswith("about 10 s left")
 

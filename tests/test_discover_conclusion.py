@@ -1,4 +1,4 @@
-"""How a search ends: signs that an effect stands in for another, limits of the verdict, the proposal."""
+"""End of a search: signs that an effect stands in for another, limits of the verdict, the proposal."""
 
 import dataclasses
 import functools
@@ -45,13 +45,13 @@ from rotflex_jax.recording import Recording
 
 
 def with_friction(at: LikelihoodProblem, level: float) -> Hypothesis:
-    """A fit that began with friction of that level at the hub."""
+    """A fit that starts with friction of this level at the hub."""
     h = with_effect(supermodel(), start(at), CandidateStart(HUB, np.array([level])), 1.0)
     return levenberg_marquardt(at, [h])[0]
 
 
 def mixed(levels: tuple[float, float]) -> LikelihoodProblem:
-    """Two recordings of machines whose friction is not the same."""
+    """Two recordings of machines with these levels of friction."""
     made = [records(level)[k] for k, level in enumerate(levels)]
     return problem(recordings(tuple(made)))
 
@@ -69,14 +69,14 @@ def test_an_effect_of_the_machine_has_one_size(same):
 
 
 def test_two_sizes_show_as_scatter():
-    """Friction of 0.012 and 0.028 N m asks for changes of +-40 % around the mean."""
+    """Friction of 0.012 and 0.028 N m is +-40 % around its mean."""
     at = mixed((0.012, 0.028))
     sizes = window_sizes(at, with_friction(at, 0.03), [HUB])[HUB]
     assert 0.25 < sizes.scatter < 0.55
 
 
 def test_an_effect_that_does_little_changes_little():
-    """A hundredth of the friction is less than what its absence leaves."""
+    """With a hundredth of the true friction, the change by it is small against the error that is left."""
     at = mixed((0.02, 0.02))
     s, h = supermodel(), start(at)
     little = with_effect(s, h, CandidateStart(HUB, np.array([2e-4])), 1.0)
@@ -84,7 +84,7 @@ def test_an_effect_that_does_little_changes_little():
 
 
 def test_nats_above_the_noise_by_hand(same):
-    """`N log(rms / noise)` of each channel: half the noise is `log 2` more for each value above it."""
+    """`N log(rms / noise)` by hand, summed over channels whose error is above the noise."""
     at, h = same
     e, counted = at.innovations([h])[0], at.seen > 0
     # Far below any error, so that each channel counts.
@@ -94,7 +94,7 @@ def test_nats_above_the_noise_by_hand(same):
     assert nats_above_noise(tiny, h) == pytest.approx(expected, rel=1e-9)
     huge = dataclasses.replace(at, dataset=dataclasses.replace(at.dataset, noise=NOISE * 1e3))
     assert nats_above_noise(huge, h) == 0.0
-    # Samples that were not seen do not count, however large their error.
+    # Samples with `seen` zero do not count, however large their error.
     errors, seen = np.full((1, 8, 1), 2.0), np.arange(8)[None] < 6
     errors[:, 6:] = 1e6
     of = {"innovations": lambda hypotheses: [errors], "seen": seen.astype(float), "noise": np.ones(1)}
@@ -124,7 +124,10 @@ def test_each_sign_is_a_sentence(same):
 @pytest.mark.parametrize("folds", [True, False], ids=["validating each other", "held out"])
 @pytest.mark.parametrize("beyond", [None, "scatter", "change", "gain", "any scatter", "no change"])
 def test_the_limit_of_each_sign_from_both_sides(beyond, folds, monkeypatch: pytest.MonkeyPatch):
-    """15 % of the size, half of the error that is left, the nats left in both sets; the worse set counts."""
+    """The limits are 15 % of the size, half of the error that is left, and the nats left in both sets.
+
+    The worse of training and validation data counts for the first two.
+    """
     space = types.SimpleNamespace
     validation = space(folds=folds, problem="free runs, held out", window_seconds=2.0)
     prediction = space(problem="predictions", validation=space(folds=folds, problem="predictions, held out"))
@@ -132,7 +135,7 @@ def test_the_limit_of_each_sign_from_both_sides(beyond, folds, monkeypatch: pyte
     scatter = {"scatter": 0.152, "any scatter": 2e4}.get(beyond, 0.15)
     change = {"change": 0.495, "no change": 1.9e-6}.get(beyond, 0.5)
     sizes = {"free runs": WindowSizes(0.01, 9.0), "free runs, held out": WindowSizes(scatter, change)}
-    if folds:  # the recordings for training are all there are
+    if folds:  # there are no recordings but those for training
         sizes = {"free runs": sizes["free runs, held out"]}
     left = {"predictions": 30.0, "predictions, held out": 20.0}
     monkeypatch.setattr(conclusion, "window_sizes", lambda problem, h, locations: {HUB: sizes[problem]})
@@ -149,18 +152,18 @@ def test_the_limit_of_each_sign_from_both_sides(beyond, folds, monkeypatch: pyte
 
 
 def test_sensor_faults_of_an_impossible_size_are_not_physical():
-    """A fifth of the servo angle in a strain gauge, or a disc 8 degrees out of centre, is something else."""
+    """A cross-talk of a fifth of the servo angle or a disc 8 degrees off centre is outside the ranges."""
     for fault, names in ((CrossTalk, ("share",)), (EccentricEncoder, ("sine", "cosine"))):
         for name in names:
             low, high = specifications(fault(at="theta"))[name].physical
             assert -0.14 < low < -0.02 < 0.02 < high < 0.14
-    # A gauge may be off by a third. One that reads a tenth of the true value, or ten times, has another unit.
+    # A gain may be wrong by a third. A tenth of the true value, or ten times this value, is another unit.
     low, high = specifications(SensorGain(at="alpha"))["error"].physical
     assert -0.9 < low < -0.3 < 0.5 < high < 9.0
 
 
 def test_a_window_that_diverges_says_nothing(same):
-    """The others do: the numbers are those of the windows that are left."""
+    """Scatter and change are computed without it; there is no result if all windows diverge."""
     at, h = same
     x0 = h.x0.copy()
     x0[0, 0] = np.nan
@@ -170,7 +173,7 @@ def test_a_window_that_diverges_says_nothing(same):
 
 
 def test_one_effect_in_the_place_of_several_has_the_signs_of_its_part(monkeypatch: pytest.MonkeyPatch):
-    """A merged effect stands in no fit at both horizons, so it answers for the part that it took over."""
+    """A merged effect is in no fit at both horizons, so it gets the signs of the effect that it replaces."""
     merged = EffectLocation("coulomb_asymmetric", "hub")
     state = types.SimpleNamespace(
         gains={HUB: (HorizonGain(1.0, 2.0, 0.5, 3.0), None), merged: (HorizonGain(1.0, 2.0, 0.5, 3.0), None)},
@@ -186,7 +189,7 @@ def test_one_effect_in_the_place_of_several_has_the_signs_of_its_part(monkeypatc
 
 
 def test_a_bias_beside_another_fault_of_its_sensor_is_provisional(monkeypatch: pytest.MonkeyPatch):
-    """Beside a fault of another sensor, or friction, it is not."""
+    """The other fault may look like a bias. Faults of other sensors, friction and channel delays may not."""
     rectifier, bias, other = (
         EffectLocation(*p)
         for p in (("rectifier", "alpha"), ("sensor_bias", "alpha"), ("sensor_bias", "theta"))
@@ -205,7 +208,7 @@ def test_a_bias_beside_another_fault_of_its_sensor_is_provisional(monkeypatch: p
         "alpha has another fault (rectifying sensor of alpha), a part of which may look like a bias"
     )
     assert set(summary.stand_ins(state)) == {bias}
-    # A late channel has no error where nothing moves.
+    # A channel delay causes no error at rest.
     state.order = [EffectLocation("channel_delay", "alpha"), bias]
     assert summary.stand_ins(state) == {bias: ("it is small",)}
 
@@ -227,7 +230,7 @@ def told(
     candidates: int = 4,
     imitated: int = 0,
 ) -> tuple[Verdict, str]:
-    """Verdict and sentence of a search that ended so near to the noise, with equivalents of each round."""
+    """Verdict and sentence of a search with these errors over the noise and equivalents of each round."""
     floor = {"theta": 5e-4, "alpha": 2e-3}
     errors = {"theta": 5e-4, "alpha": 2e-3 * ratio}
     baseline: Any = SimpleNamespace(held_out_rmse_windows={c: before * e for c, e in errors.items()})
@@ -287,12 +290,12 @@ FRICTION, OTHER_LAWS = ("coulomb", "hub"), (("stribeck", "hub"), ("lugre", "hub"
         (FRICTION, (*OTHER_LAWS, ("stribeck", "arm")), (), ""),
         (FRICTION, (*OTHER_LAWS, ("dead_zone", "input")), (), ""),
         (("delay", "input"), (("lag", "input"),), (), "late input"),
-        # Neither is a law of anything.
+        # Neither effect is a law.
         (("dead_zone", "input"), (("saturation", "input"),), (), ""),
     ],
 )
 def test_what_is_certain_where_a_law_is_not(effect, equivalent, doubts, certain) -> None:
-    """Nothing but laws of the same thing at the same port may be open."""
+    """The thing is certain if all equivalents are its laws at the same port, and there is no other doubt."""
     (like,) = found().rounds
     turn = dataclasses.replace(
         like, effect=effect[0], port=effect[1], equivalent=equivalent, doubts=doubts, prediction=HELPS
@@ -327,7 +330,7 @@ TS, SD = 0.01, 5e-4
 
 
 def found(verdict: Verdict = Verdict.AMBIGUOUS) -> Discovery:
-    """A delay that could as well be a lag, as a search would tell it."""
+    """The result of a search that found a delay, with a lag as its equivalent."""
     m = rf.joints.paper(joint_damping=0.003, hub_damping=0.004)
     grown = m + fx.Delay(time=0.012)
     u = noise(400, TS, rms=0.8, seed=1)
@@ -358,7 +361,7 @@ def test_the_best_standard_input_is_proposed_within_what_the_machine_has_borne(a
     assert np.max(np.abs(e.u)) <= limits.voltage == np.max(np.abs(answered.train[0].u))
     assert e.chosen.peaks["alpha"] <= limits.deflection
     assert e.numbers["delay@input"]["time"] == 0.012
-    # The lag that looks like that delay.
+    # The rival fit gives a lag of about the same time.
     assert e.numbers["lag@input"]["time"] == pytest.approx(0.012, rel=0.5)
     assert e.chosen.nats > 1
 
@@ -383,7 +386,7 @@ def test_no_design_without_an_equal():
 
 
 def test_a_proposal_that_fails_is_a_note():
-    """An effect that the catalogue lacks, for one."""
+    """Here the equivalent effect is not in the catalogue."""
     result = found()
     turn = dataclasses.replace(result.rounds[0], equivalent=(("unknown", "input"),))
     told = with_proposal(dataclasses.replace(result, rounds=(turn,)))
@@ -397,7 +400,7 @@ def test_a_proposal_that_fails_is_a_note():
 )
 def test_the_grade_of_an_error(times: float, expected: Grade | None) -> None:
     assert grade(times) is expected
-    # That of the channel which is furthest, of those whose noise is known.
+    # Of several channels the worst one counts, among those with known noise.
     assert Assessment({}, {"theta": times, "alpha": 0.5, "beta": math.nan}, 0.0).grade is (
         expected or Grade.NOISE
     )
@@ -440,7 +443,7 @@ def test_candidates_that_could_not_have_shown_are_a_step() -> None:
 
 
 def test_the_machine_has_borne_the_most_of_any_recording() -> None:
-    """Of voltage, slew and deflection each for itself."""
+    """The limits are the largest voltage, slew rate and deflection, each over all recordings."""
     k = np.arange(60)
     slow, quick = (np.sin(k / 20), 0.5 * np.sin(k))
     y = np.column_stack([np.cos(k / 9), 0.1 * np.cos(k / 9)])
@@ -457,7 +460,7 @@ def test_the_machine_has_borne_the_most_of_any_recording() -> None:
 
 
 def test_sizes_in_windows_by_hand() -> None:
-    """One Gauss-Newton step of the amplitudes in each window, beside what a window moves of its own."""
+    """One Gauss-Newton step of the amplitude in each window, orthogonal to the local parameter."""
     rng = np.random.default_rng(0)
     R, N, C = 2, 60, 2
     names = ("hub.coulomb.level", "arm.inertia.inertia", "offset of a recording")
@@ -470,7 +473,7 @@ def test_sizes_in_windows_by_hand() -> None:
         slopes=lambda hypotheses: (
             e[None],
             np.concatenate([J, J[:1]])[None],
-        ),  # first states are beyond `moved`
+        ),  # the last row is beyond `moved`
         windows=SimpleNamespace(of=lambda r: [(0, slice(0, 25)), (1, slice(25, N))]),
     )
     h: Any = SimpleNamespace(
@@ -487,7 +490,7 @@ def test_sizes_in_windows_by_hand() -> None:
     wanted = acts = rest = 0.0
     for r in range(R):
         for samples in (slice(0, 25), slice(25, N)):
-            # Columns follow the free parameters, then those of a recording: the level is the second.
+            # Rows are the free parameters, then the local one; the level is the second free parameter.
             slope, other = J[1, r, samples].ravel() / derivative, J[2, r, samples].ravel()
             left = e[r, samples].ravel()
             slope, left = (x - other * (other @ x) / (other @ other) for x in (slope, left))
@@ -502,8 +505,8 @@ def test_sizes_in_windows_by_hand() -> None:
     e *= 1e-6
     J *= 1e-6
     again = window_sizes(problem, h, [EffectLocation("coulomb", "hub")])[EffectLocation("coulomb", "hub")]
-    assert again == pytest.approx(found)  # whatever the unit
-    # Nothing is said of what is nowhere, or of runs without an error.
+    assert again == pytest.approx(found)  # in any unit
+    # There is no result for runs without an error, or for an effect that changes nothing.
     e[:] = 0.0
     assert window_sizes(problem, h, [EffectLocation("coulomb", "hub")]) == {}
     e[:], J[1] = 1.0, 0.0
@@ -562,7 +565,7 @@ def test_the_sentence_gives_the_reason(given: dict[str, Any], sentence: str) -> 
 
 
 def test_the_first_effect_with_an_equal_is_asked_about(monkeypatch: pytest.MonkeyPatch) -> None:
-    """With the settings of the longest recording, whose first ten seconds the rival is fitted to."""
+    """With the settings of the longest recording; the rival is fitted to its first ten seconds."""
     monkeypatch.setattr(conclusion, "next_experiment", lambda *given, **settings: (given, settings))
     k = np.arange(3000)
     y = np.column_stack([np.cos(k / 9), 0.1 * np.cos(k / 9)])
@@ -587,7 +590,7 @@ def test_the_first_effect_with_an_equal_is_asked_about(monkeypatch: pytest.Monke
     assert given == ("the model", ("coulomb", "hub"), ("stribeck", "hub"))
     assert settings["Ts"] == 0.5 and settings["limits"] == seen_limits((short, long))
     np.testing.assert_array_equal(settings["reference"], long.u[:1000])
-    # A line has another phase in the next recording, whether it was found or is the equal.
+    # A periodic disturbance has another phase in the next recording, so pairs with one are skipped.
     (line,) = (name for name, effect in fx.CATALOG.items() if effect.line)
     of_a_line = [SimpleNamespace(effect=line, port="input", equivalent=(("cogging", "hub"),))]
     of_a_line += [SimpleNamespace(effect="cogging", port="hub", equivalent=((line, "input"),))]

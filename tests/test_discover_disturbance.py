@@ -1,4 +1,4 @@
-"""A sine from outside: named with frequency and size where there is one, not tried where there is none."""
+"""Periodic disturbance: found with frequency and amplitude if there is one, otherwise no candidate."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ CANDIDATES = [(Coulomb, "hub"), (PeriodicDisturbance, "input"), (VoltageDrift, "
 
 
 def recording(size: float, seed: int) -> rf.Recording:
-    """Friction at the hub; the motor sees a sine more than was recorded. From an independent simulator."""
+    """From an independent simulator: friction at the hub, and a sine at the motor that is not recorded."""
     u = rf.data.excitation.noise(round(SECONDS * FS), 1 / FS, seed=seed)
     wave = size * np.sin(2 * np.pi * FREQUENCY * np.arange(len(u)) / FS + seed)
     r = make_record({("coulomb", "hub"): {"level": 0.02}}, seed=seed, fs=FS, played=u + wave)
@@ -37,14 +37,14 @@ def test_a_disturbance_is_named_with_its_frequency_and_size_beside_friction(dist
 
 
 def test_its_phase_is_that_of_each_recording(disturbed) -> None:
-    """Errors on validation data are those with the phase found there, not with that of training."""
+    """Errors on validation data are computed with the phase fitted to them, not with that of training."""
     (of_validation,) = disturbed.final.of_validation
     trained, own = (
         m.mechanism.effect("periodic_disturbance", "input") for m in (disturbed.model, of_validation)
     )
     assert own.frequency == trained.frequency
     phases = [np.arctan2(e.cosine, e.sine) for e in (trained, own)]
-    # Validation begins after seven seconds, and its time at zero again.
+    # Validation data begin after seven seconds, where their time is zero again.
     moved = 2 * np.pi * own.frequency * 0.7 * SECONDS
     assert np.angle(np.exp(1j * (phases[1] - phases[0] - moved))) == pytest.approx(0, abs=0.3)
     validation = disturbed.validation[0]
@@ -59,7 +59,10 @@ def test_its_phase_is_that_of_each_recording(disturbed) -> None:
 
 
 def test_any_of_several_recordings_may_have_it() -> None:
-    """And what is reported of it is what the model has: the phases of recordings have no mean."""
+    """One of two training recordings has a disturbance, and it is found.
+
+    The reported parameters are those of the model, since the mean of phases of recordings has no meaning.
+    """
     runs = [recording(0.0, 5).slice(0, 1200), recording(SIZE, 6).slice(0, 1200)]
     found = rf.discover(
         rf.joints.paper() + Coulomb("hub", level=0.02),
@@ -75,7 +78,7 @@ def test_any_of_several_recordings_may_have_it() -> None:
         assert only.parameters[name].value == pytest.approx(getattr(effect, name))
         assert only.parameters[name].value == pytest.approx(
             0.0, abs=0.05
-        )  # of the first recording, without one
+        )  # of the first recording, which has none
 
 
 def test_without_a_line_it_is_no_candidate() -> None:

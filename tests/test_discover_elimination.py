@@ -1,4 +1,4 @@
-"""What a model can do without: an effect beside a law that contains it."""
+"""Backward elimination of an effect beside a law that contains it."""
 
 import dataclasses
 from types import SimpleNamespace
@@ -51,7 +51,10 @@ def simulated(s: SuperModel, h: Hypothesis) -> np.ndarray:
 
 
 def test_a_law_that_contains_an_effect_takes_over_its_size(s):
-    """Two levels of dry friction at one port are one: the run is the same, without the level it is not."""
+    """The level of Coulomb friction is added to that of Stribeck friction, so the free run stays the same.
+
+    Without this addition the run changes by more than 20 times the noise.
+    """
     both = holding(s, COULOMB, STRIBECK, ARM)
     y = simulated(s, both)
     one = handed_over(s, both, COULOMB)
@@ -60,10 +63,10 @@ def test_a_law_that_contains_an_effect_takes_over_its_size(s):
     np.testing.assert_allclose(values, [0.007, 0.002, 0.5], rtol=1e-9)
     np.testing.assert_allclose(simulated(s, one), y, atol=1e-9)
     assert np.abs(simulated(s, without(s, both, COULOMB)) - y).max() > 20 * sp.NOISE[0]
-    # A law at another port and one that contains nothing that is on take nothing, nor do calibrations.
+    # There is no law in the model that contains these effects at their ports, nor one for calibrations.
     assert handed_over(s, both, ARM) is handed_over(s, both, STRIBECK) is None
     assert all(handed_over(s, both, p) is None for p in s.calibrations)
-    # Cogging contains gravity at one of its periods only, and its amplitudes are no place for it at another.
+    # Cogging contains gravity at one of its periods only; at others its amplitudes cannot take over gravity.
     gravity, cogging = EffectLocation("gravity", "hub"), EffectLocation("cogging", "hub")
     assert cogging.contains(gravity)
     turning = with_effect(s, with_effect(s, both, usual_start(s, gravity), 1.0), usual_start(s, cogging), 1.0)
@@ -72,7 +75,10 @@ def test_a_law_that_contains_an_effect_takes_over_its_size(s):
 
 @pytest.mark.parametrize("locations", [(COULOMB, STRIBECK), (COULOMB, ARM)])
 def test_of_two_levels_at_one_port_one_is_needless(s, monkeypatch: pytest.MonkeyPatch, locations):
-    """Coulomb friction beside Stribeck friction goes, even if no fit finds its way; elsewhere it stays."""
+    """Coulomb friction beside Stribeck friction at the hub is left out, even if nothing is refitted.
+
+    Beside Coulomb friction at the arm it stays.
+    """
     true = simulated(s, holding(s, *locations))
 
     def costs(hypotheses: list[Hypothesis]) -> list[np.ndarray]:
@@ -101,7 +107,10 @@ def test_of_two_levels_at_one_port_one_is_needless(s, monkeypatch: pytest.Monkey
 
 @pytest.mark.parametrize("more", [COULOMB, STRIBECK])
 def test_the_law_that_is_left_has_gained_what_was_found_first(s, monkeypatch: pytest.MonkeyPatch, more):
-    """What Coulomb friction has gained goes to Stribeck friction in its place, with its rivals."""
+    """Stribeck friction gets the rivals of the Coulomb friction that it replaces.
+
+    It also gets the gain and the score of Coulomb friction if this gain is larger.
+    """
     left, elsewhere = holding(s, STRIBECK, ARM), EffectLocation("gravity", "hub")
     alike = ValidatedHypothesis(left, np.zeros(2), left, np.ones(2))
     current = dataclasses.replace(alike, hypothesis=holding(s, COULOMB, STRIBECK, ARM), free_run=alike)

@@ -1,4 +1,4 @@
-"""What a search reports of a model: on which data its errors are, and whether an effect is established."""
+"""Report on a model of a search: errors with the data they are on, and whether effects are established."""
 
 import dataclasses
 import json
@@ -32,7 +32,7 @@ def test_sizes_agree_within_their_intervals_or_nearly():
     assert compared(level(0.020, 6e-3), level(0.035, 6e-3)) == ""
     near = 0.020 / (1 - 0.9 * SAME_SIZE)
     assert compared(level(0.020, 1e-6), level(near, 1e-6)) == ""
-    # What one part does not determine is no agreement either.
+    # A size that one part of the data does not determine does not agree.
     for other in (level(0.035, np.nan), ()):
         assert "not determine" in compared(level(0.020, 1e-4), other)
 
@@ -64,7 +64,10 @@ def ranked(prediction: dict[str, float], free_run: dict[str, float], most: int =
 
 
 def test_both_rankings_propose():
-    """Shares of the best add up; the best of each is always refitted; what is far below both is not."""
+    """Candidates are ranked by the sum of their shares of the best scores at both horizons.
+
+    The best candidate of each horizon is always refitted, a candidate with a small sum is not.
+    """
     prediction = {"gravity": 100.0, "coulomb": 80.0, "cogging": 70.0, "viscous": 5.0, "dahl": -3.0}
     runs = {"gravity": 10.0, "coulomb": 900.0, "cogging": 100.0, "viscous": 20.0, "dahl": 1000.0}
     assert ranked(prediction, runs) == ["coulomb", "gravity", "dahl"]  # 1.7, 1.01, and best in free runs
@@ -84,24 +87,24 @@ def replaced(before: tuple[dict, dict], after: tuple[dict, dict], tried=(), winn
 
 def test_candidates_whose_score_the_winner_took_are_refitted_too():
     before = ({"gravity": 100.0, "coulomb": 15.0}, {"coulomb": 400.0, "cogging": 500.0, "backlash": 90.0})
-    # Beside the winner the score of Coulomb friction is nothing; those of gravity and cogging hardly change.
+    # With the winner, Coulomb friction loses its score; those of gravity and cogging hardly change.
     after = ({"gravity": 90.0, "coulomb": -3.0}, {"coulomb": 2.0, "cogging": 480.0, "backlash": -4.0})
     assert replaced(before, after) == ["coulomb"]
     assert replaced(before, after, tried=("coulomb",)) == []
     assert replaced(before, ({"coulomb": 12.0}, {"coulomb": 300.0, "cogging": 480.0})) == ["gravity"]
-    # A part of it that is left may be an effect of its own; what contains the winner is tested again later.
+    # One that keeps a part may be a separate effect; a law that contains the winner is tested again later.
     assert "coulomb" not in replaced(before, (after[0] | {"coulomb": 9.0}, after[1] | {"coulomb": 90.0}))
     rich = ({"lugre": 100.0}, {"lugre": 100.0})
     assert replaced(rich, ({}, {}), winner="coulomb") == []
     assert replaced(rich, ({}, {}), winner="cogging") == ["lugre"]
-    # A quarter of the best is enough, and a tenth of its own is not lost.
+    # A score of a quarter of the best is enough; one of which a tenth is left is not lost.
     quarter = ({"gravity": 100.0, "coulomb": 25.0, "viscous": 24.9}, {})
     assert replaced(quarter, ({"gravity": 95.0}, {})) == ["coulomb"]
     assert replaced(({"gravity": 40.0}, {}), ({"gravity": 4.0}, {})) == []
-    # Two at most, those with the largest shares over both horizons.
+    # At most two are taken, those with the largest shares over both horizons,
     gone = ({}, {})
     assert replaced(before, gone) == ["gravity", "cogging"]
-    # However small their scores.
+    # however small their scores are.
     assert replaced(({"gravity": 1.5, "coulomb": 0.5}, {}), gone) == ["gravity", "coulomb"]
 
 

@@ -1,4 +1,4 @@
-"""Coloured noise of a sensor is told from what a model lacks."""
+"""Coloured noise of a sensor is distinguished from errors of the model."""
 
 import dataclasses
 
@@ -32,11 +32,11 @@ def test_an_ar1_is_told_with_its_coefficient(a: float) -> None:
         u, motion = driven(seed)
         found.append(coloured_noise(0.01 * ar1(np.random.default_rng(seed), a), motion, u, Ts))
     told = [x for x in found if x is not None]
-    assert len(told) >= 17  # four tests of one in a thousand or less each
+    assert len(told) >= 17  # each of four tests rejects at most once in 1000
     assert np.mean(told) == pytest.approx(a, abs=0.02)
 
 
-# What is no AR(1), or depends on the motion; each in 10 records.
+# Errors that are no AR(1), or that depend on the motion; each is tested in 10 recordings.
 OTHER = {
     "white": lambda rng, u, m: rng.standard_normal(N),
     "an AR(2)": lambda rng, u, m: scipy.signal.lfilter([1], [1, -1.2, 0.7], rng.standard_normal(N)),
@@ -74,7 +74,7 @@ def with_noise(run: rf.Recording, noise: np.ndarray) -> rf.Recording:
 
 
 def test_the_next_steps_of_a_verdict_say_so() -> None:
-    """A right model and a tacho with coloured noise; then one that lacks its friction."""
+    """They name an AR(1) for a right model with a noisy tacho, and not for a model that lacks friction."""
     joint = SPINDLE + rf.effects.Coulomb(at="shaft")
     parts = with_noise(spun(4000), 0.05 * ar1(np.random.default_rng(5), 0.9, 4000)).split(0.5)
     right = rf.discover(joint, *parts, candidates=PAIRS[1:], rounds=0)

@@ -37,8 +37,8 @@ def run(level: float, offset: float, seed: int, N: int = 3000, excess: float = 0
 
         J w' = c (u + offset) - b w - friction
 
-    in explicit steps of 0.1 ms; the friction holds, and has another level in each run. With an `excess` it
-    falls with the speed (Stribeck), on a scale of 1 rad/s. The encoder has steps of 0.5 mrad.
+    in explicit steps of 0.1 ms, with static friction. With an `excess` the friction falls with the speed
+    (Stribeck), on a scale of 1 rad/s. The encoder has steps of 0.5 mrad.
     """
     Ts, fine = 0.002, 20
     rng, h = np.random.default_rng(seed), Ts / fine
@@ -60,7 +60,7 @@ def run(level: float, offset: float, seed: int, N: int = 3000, excess: float = 0
 
 @pytest.fixture(scope="module")
 def runs():
-    """For training, for validation, and for testing, whose friction lies between that of the others."""
+    """Runs for training, validation and testing; the friction of the last is between that of the others."""
     return run(0.05, 0.0, 0), run(0.075, 0.0, 1), run(0.07, 0.0, 2)
 
 
@@ -80,13 +80,14 @@ def level_of(model: rf.Model) -> float:
 
 
 def short_runs_miss(model: rf.Model, r: rf.Recording) -> float:
-    """Error over windows, written out: the first samples of each window do not count."""
+    """Root mean square error over windows of 2 s, without the first `n_init` samples of each window."""
     e, window = (model.simulate_windows(r, 2.0) - r.y)[:, 0], round(2.0 / r.Ts)
     counted = [part[r.n_init :] for part in np.split(e, range(window, r.N, window))]
     return float(np.sqrt(np.mean(np.concatenate(counted) ** 2)))
 
 
 def test_it_has_learnt_from_both(found, runs):
+    """The final fit has a level between those of both runs, and a smaller error on the test run."""
     last, (_, _, test) = found.final_fit, runs
     assert found.verdict == "unexplained" and last is not None
     assert found.model is last.model
@@ -100,7 +101,7 @@ def test_its_errors_are_those_of_its_model(found, runs):
     assert last.test.windows["theta"] == pytest.approx(short_runs_miss(last.model, test), rel=1e-6)
     whole = rf.metrics.rmse(test, last.model.simulate(test))["theta"]
     assert last.test.whole["theta"] == pytest.approx(whole, rel=1e-6)
-    # It is the fit that a user makes; the same fit to training data alone was tried on validation data.
+    # `rf.fit` gives the same; fitted to training data alone, it gives the errors `trained`.
     structure, local = found.final.model.mechanism, list(last.fit.local)
     if OFFSET in local:
         structure = structure + rf.effects.VoltageOffset("input")
@@ -112,7 +113,7 @@ def test_its_errors_are_those_of_its_model(found, runs):
 
 
 def test_offsets_stay_with_their_runs(arm, monkeypatch):
-    """Another run has none of them; what follows in a run that was fitted has those of that run."""
+    """Another run gets no offset; a later part of a fitted run gets the offset of this run."""
     monkeypatch.setattr(MODULE, "MOST_WORSE", np.inf)
     train = run(0.06, 0.03, 0)
     validation, rest = run(0.06, -0.03, 1, N=4500).split(2 / 3)
@@ -131,7 +132,7 @@ def test_offsets_stay_with_their_runs(arm, monkeypatch):
 
 
 def test_what_runs_have_in_common_of_their_offsets_is_carried_over(arm, monkeypatch):
-    """The search leaves 0.06 and 0.02 V to the recordings: the first is no good for the second run."""
+    """For runs with offsets of 0.06 and 0.02 V, the model to use has an offset of 0.03 V."""
     monkeypatch.setattr(MODULE, "MOST_WORSE", np.inf)
     given = run(0.06, 0.06, 0), run(0.06, 0.02, 1)
     found = rf.discover(arm + Coulomb("hub", level=0.02), *given, candidates=[], rounds=0)
@@ -139,12 +140,15 @@ def test_what_runs_have_in_common_of_their_offsets_is_carried_over(arm, monkeypa
     assert value[OFFSET] == pytest.approx(0.03, abs=0.003)  # 0.04 (1 - 0.0008 / (2 0.04^2))
     estimate = next(e for e in found.estimates if e.name == OFFSET)
     assert estimate.value == value[OFFSET]
-    assert estimate.std == pytest.approx(0.02, abs=0.003)  # of the mean of two
+    assert estimate.std == pytest.approx(0.02, abs=0.003)  # standard deviation of the mean of two
     assert [n for n in found.notes if f"the model to use has {value[OFFSET]:+.3g} V." in n]
 
 
 def test_what_most_runs_have_in_common_may_not_suit_a_run_of_validation_data(arm):
-    """Of 0.06, 0.06 and 0 V half would be carried over; the fit is kept, without it."""
+    """For offsets of 0.06, 0.06 and 0 V, 0.03 V would be carried over.
+
+    This does not suit the validation run, which has no offset. So the model to use has no offset either.
+    """
     train, validation = [run(0.06, 0.06, 0), run(0.06, 0.06, 1)], run(0.06, 0.0, 2)
     found = rf.discover(arm + Coulomb("hub", level=0.02), train, validation, candidates=[], rounds=0)
     last = found.final_fit
@@ -156,7 +160,7 @@ def test_what_most_runs_have_in_common_may_not_suit_a_run_of_validation_data(arm
 
 
 def test_of_two_calibrations_one_may_be_carried_over(monkeypatch):
-    """Offsets of 0.06 and 0.02 V have 0.03 V in common, biases of 4 and -4 mrad nothing."""
+    """The common part of offsets of 0.06 and 0.02 V is 0.03 V; that of biases of 4 and -4 mrad is zero."""
     monkeypatch.setattr(MODULE, "MOST_WORSE", np.inf)
     joint, given = rf.joints.paper() + Coulomb("hub", level=0.02), []
     truth = joint.with_values({LEVEL: 0.03}) + rf.effects.CubicSpring("joint", stiffness=20.0)
@@ -169,7 +173,7 @@ def test_of_two_calibrations_one_may_be_carried_over(monkeypatch):
         given.append(rf.Recording(u, y, 0.002, channels=("theta", "alpha"), n_init=50))
     found = rf.discover(joint, *given, candidates=[], rounds=0)
     value, local = values_of(found.model), found.final_fit.fit.local
-    # The spring that is missing bends both alike.
+    # The missing cubic spring shifts both biases alike.
     assert np.diff([e.value for e in local["alpha.sensor_bias.bias"]]) == pytest.approx(-0.008, abs=5e-4)
     assert value[OFFSET] == pytest.approx(0.03, abs=0.003)
     assert "alpha.sensor_bias.bias" not in value
@@ -178,7 +182,10 @@ def test_of_two_calibrations_one_may_be_carried_over(monkeypatch):
 
 @pytest.mark.parametrize("kept_for", ["its use", "validation data", ""])
 def test_an_offset_of_the_one_run_that_it_hardly_needs_is_left_out(arm, monkeypatch, kept_for):
-    """It makes validation data better, which are of the same run; other runs do not have it."""
+    """Validation data of the same run are better with the offset, but other runs do not have it.
+
+    It stays if free runs are clearly better with it, or if the fit without it is refused.
+    """
     asked, errors_of = [], MODULE._on_validation
 
     def prefer(last, a, b, every=False):
@@ -222,7 +229,7 @@ def test_an_offset_of_the_one_run_that_it_hardly_needs_is_left_out(arm, monkeypa
     ],
 )
 def test_what_runs_have_in_common(values, common):
-    """By hand: mean m, variance s^2, m max(0, 1 - s^2 / (K m^2))."""
+    """The values by hand: m max(0, 1 - s^2 / (K m^2)) from the mean m and variance s^2 of K runs."""
     each = [Estimate(OFFSET, v, 1e-4, (v - 2e-4, v + 2e-4), "V") for v in values]
     found = STRUCTURE._common(each)
     assert found.value == pytest.approx(common)
@@ -238,7 +245,7 @@ def values_of(model: rf.Model) -> dict[str, float]:
 
 @pytest.fixture
 def fits(monkeypatch):
-    """What is fitted: model, recordings, local parameters, end of each; structures with the best ends."""
+    """Records fits: model, recordings, local parameters, result; and structures with their best fits."""
     each, best, fit, fit_structures = [], [], STRUCTURE.fit, MODULE.fit_structures
 
     def noted(model, recordings, **how):
@@ -256,7 +263,7 @@ def fits(monkeypatch):
 
 
 def test_an_end_that_the_recordings_do_not_reach_is_taken_only_alone(monkeypatch):
-    """Even where it is likelier; an end without a cost comes last."""
+    """It is not taken even if it is likelier than the others. A fit without a finite cost comes last."""
     remark = Remark("hub.cogging.periods", "beyond the recordings", "")
     bound = Remark("hub.lugre.damping", "at a bound", "")
 
@@ -272,7 +279,10 @@ def test_an_end_that_the_recordings_do_not_reach_is_taken_only_alone(monkeypatch
 
 
 def test_it_starts_from_usual_values_too_and_takes_the_likelier_end(runs, arm, fits, monkeypatch):
-    """Of what was found first the sizes are kept, then nothing; the user's model is then as given."""
+    """Starts: parameters of the search; the same with usual shapes of the effects found; all as given.
+
+    In the last one the effects found have usual values, and the user's model is as given.
+    """
     monkeypatch.setattr(MODULE, "MOST_WORSE", np.inf)
     train, validation, _ = runs
     rf.discover(arm, train, validation, candidates=[(rf.effects.Stribeck, "hub")], rounds=1)
@@ -290,10 +300,10 @@ def test_it_starts_from_usual_values_too_and_takes_the_likelier_end(runs, arm, f
             for m, r, local, e in fits.each
             if (len(r), local) == (len(given), structure.local) and any(m is s for s in structure.starts)
         ]
-        # With a Stribeck speed that the arm has reached, if there is one.
+        # A fit with a Stribeck speed that the arm has not reached is taken only if there is no other.
         reached = [e for e in ends if not any(r.kind == "beyond the recordings" for r in e.remarks)]
         assert len(ends) == len(structure.starts) and end.cost == min(e.cost for e in reached or ends)
-        # The fit to all starts from that to training recordings besides.
+        # The fit to all recordings also starts from the fit to training recordings.
         assert more in ([],) if len(given) == 1 else more[0] in [values_of(e.model) for e in alone]
 
 
@@ -303,13 +313,13 @@ LAWS_ON = tuple((law.name, port) for law, port in LAWS)
 
 @pytest.fixture
 def coulomb_found(monkeypatch):
-    """A search that takes the simpler law, whatever the data are, and leaves it where it is."""
+    """Make a search choose the simpler law for any data, and not replace it at the end."""
     monkeypatch.setattr(sys.modules[choose.__module__], "_clearly_better", lambda *given: False)
     monkeypatch.setattr(sys.modules[rf.discover.__module__], "take_better_laws", lambda state: ())
 
 
 def falling(seed: int) -> rf.Recording:
-    """A run with friction that falls with the speed, of a level of its own."""
+    """A run with friction that falls with the speed; the level differs between runs."""
     return run((0.02, 0.03, 0.025)[seed], 0.0, seed, excess=0.1)
 
 
@@ -332,10 +342,10 @@ def test_a_law_that_free_runs_prefer_by_far_stands_in_the_model_to_use(
     read = rf.Model.load(found.save(tmp_path / "model.json"))
     np.testing.assert_array_equal(read.mechanism.values, last.model.mechanism.values)
     assert found.model_of(train).mechanism.effect("stribeck", "hub")
-    # The table of a report says what the new parameters are.
+    # The table of a report has the meaning of the new parameters.
     (row,) = [r for r in parameter_rows(found) if r.name == "hub.stribeck.excess"]
     assert row.meaning and not row.held
-    # What to record next compares what was found with an equal of it, not with the law in its place.
+    # The next experiment compares the effect found with its equivalent, in the model of the search.
     asked = []
     monkeypatch.setattr(
         conclusion, "next_experiment", lambda model, *pair, **how: asked.append((model, pair))
@@ -343,7 +353,7 @@ def test_a_law_that_free_runs_prefer_by_far_stands_in_the_model_to_use(
     added = dataclasses.replace(found.rounds[0], equivalent=(("stribeck", "hub"),))
     conclusion.proposed(dataclasses.replace(found, rounds=(added,)))
     assert asked == [(found.final.model, (("coulomb", "hub"), ("stribeck", "hub")))]
-    # Models of probable sets start from what was fitted.
+    # Models of probable sets start from the parameters of the search.
     monkeypatch.setattr(until_decided, "fit", lambda model, recordings: model)
     models, _ = until_decided.models_of(found, lambda line: None)
     (coulomb,) = [m for name, m in models.items() if name == "coulomb@hub"]
@@ -351,7 +361,7 @@ def test_a_law_that_free_runs_prefer_by_far_stands_in_the_model_to_use(
 
 
 def test_a_law_where_runs_validate_each_other(arm, coulomb_found):
-    """Each run is missed by the law that the others teach no more than by the one found."""
+    """Each run validates the law fitted to the others, which has smaller errors than the law found."""
     given = [falling(seed) for seed in range(3)]
     found = rf.discover(arm, given, candidates=LAWS, rounds=1)
     last = found.final_fit
@@ -363,7 +373,10 @@ def test_a_law_where_runs_validate_each_other(arm, coulomb_found):
 
 
 def test_a_law_may_pass_where_the_one_found_does_not(arm, coulomb_found, monkeypatch):
-    """Coulomb friction, fitted to the training data in this way, is far off on validation data."""
+    """The fit with Coulomb friction is refused for its errors on validation data; Stribeck friction passes.
+
+    Without Stribeck friction among the candidates there is no final fit.
+    """
     errors_of = MODULE._on_validation
 
     def far_off(structure, trained, evaluation):
@@ -393,7 +406,7 @@ def test_a_law_keeps_the_offsets_that_runs_have_in_common(arm, coulomb_found):
 
 
 def test_a_law_starts_from_the_fit_without_the_validation_data(arm, coulomb_found, fits):
-    """With the sizes that it shares with the law that was found, then with usual ones."""
+    """The first start has the values of parameters that both laws share, the second has usual values."""
     train, validation, _ = map(falling, range(3))
     rf.discover(arm, train, validation, candidates=LAWS, rounds=1)
     coulomb = [(len(given), end) for structure, given, end in fits.best if structure.on == LAWS_ON[:1]]
@@ -407,14 +420,14 @@ def test_a_law_starts_from_the_fit_without_the_validation_data(arm, coulomb_foun
 
 
 def test_a_richer_law_needs_a_use(arm, coulomb_found):
-    """Coulomb friction alone, of another level in each run."""
+    """The true friction is Coulomb friction with a different level in each run."""
     train, validation = run(0.05, 0.0, 0), run(0.075, 0.0, 1)
     found = rf.discover(arm, train, validation, candidates=LAWS, rounds=1)
     assert found.final_fit.laws == () and LEVEL in found.model.mechanism.parameter_names
 
 
 def test_a_law_that_validation_data_speak_against_is_not_taken(arm, coulomb_found, monkeypatch):
-    """Fitted to training data alone, its runs of the validation data diverge."""
+    """Stribeck friction is refused if, fitted to training data alone, it diverges on validation data."""
     errors_of = MODULE._on_validation
 
     def diverging(structure, trained, evaluation):
@@ -429,7 +442,7 @@ def test_a_law_that_validation_data_speak_against_is_not_taken(arm, coulomb_foun
 
 
 def comparing(recordings: list[Any]) -> Any:
-    """What compares fits, with nothing but recordings and the length of a run."""
+    """A builder of final fits that has only what it needs to compare fits: recordings and window length."""
     state: Any = SimpleNamespace(
         validation=SimpleNamespace(window_seconds=2.0, folds=True),
         problem=SimpleNamespace(dataset=SimpleNamespace(recordings=tuple(recordings))),
@@ -438,7 +451,7 @@ def comparing(recordings: list[Any]) -> Any:
 
 
 def test_free_runs_are_compared_by_the_likelihood_of_half_seconds(arm, runs):
-    """By scipy's normal density; the last half second is a longer one."""
+    """The reference is scipy's normal density; the last block also contains the samples that are left."""
     train = runs[0].split(0.7)[0]
     fit = rf.fit(arm + Coulomb("hub", level=0.06), train, first="measured", window_seconds=2.0)
     e = (fit.model.simulate_windows(train, 2.0) - train.y)[:, 0]
@@ -476,6 +489,7 @@ def test_a_fit_that_diverges_is_never_preferred(diverges, preferred):
 
 @pytest.mark.parametrize(("second", "preferred"), [([4.0, 5.0], True), ([0.5, -0.4], False)])
 def test_what_every_run_has_to_prefer_helps_each(second, preferred, monkeypatch):
+    """With `every`, each run must be clearly better, not only all runs together."""
     last, before = comparing([]), [np.arange(6.0)] * 2
     a, b = (SimpleNamespace(noise={"theta": x}) for x in (0.5, 1.0))
     after = [before[0] + np.tile([5.0, 6.0], 3), before[1] + np.tile(second, 3)]
@@ -485,7 +499,7 @@ def test_what_every_run_has_to_prefer_helps_each(second, preferred, monkeypatch)
 
 
 def test_friction_may_belong_to_each_run(arm):
-    """Four times as large in the run of the validation and of the test data; noise hides neither."""
+    """Friction is 0.03 N m in the training run, and 0.12 N m in the run of validation and test data."""
     train, (validation, rest) = run(0.03, 0.0, 0), run(0.12, 0.0, 1, N=6000).split(0.5)
     other = run(0.07, 0.0, 2)
     model = arm + Coulomb("hub", level=0.06)
@@ -493,7 +507,7 @@ def test_friction_may_belong_to_each_run(arm):
     last = found.final_fit
     assert last.friction == (LEVEL,)
     assert [e.value for e in last.fit.local[LEVEL]] == pytest.approx([0.03, 0.12], rel=0.05)
-    # What follows in a run has its friction, a run of which nothing is known their mean.
+    # A later part of a fitted run gets the friction of this run, an unknown run gets the mean.
     assert level_of(found.model_of(rest)) == pytest.approx(0.12, rel=0.05)
     assert level_of(found.model_of(other)) == level_of(found.model) == pytest.approx(0.075, rel=0.05)
     misses = [short_runs_miss(found.model_of(r), r) ** 2 for r in (rest, other)]
@@ -516,6 +530,7 @@ def test_friction_that_runs_share_stays_the_machine_s(arm):
 
 
 def test_data_may_speak_against_it(runs, arm, monkeypatch):
+    """A final fit with errors above the limit is refused with a note, and the search's model is used."""
     monkeypatch.setattr(MODULE, "MOST_WORSE", -np.inf)
     train, validation, _ = runs
     found = rf.discover(arm, train, validation, candidates=[], rounds=0)
@@ -527,7 +542,7 @@ def test_data_may_speak_against_it(runs, arm, monkeypatch):
 
 
 def refusals(found: rf.Discovery) -> list[str]:
-    """What is said of a final fit that was not taken."""
+    """Notes on a final fit that was refused."""
     return [n for n in found.notes if n.startswith("The model to use is that of the search, not one")]
 
 
@@ -549,25 +564,25 @@ def test_it_is_saved_and_told(found, runs, tmp_path: Path, monkeypatch):
     assert len(row.stages) == len(found.stages) + 1
     page = found.report(tmp_path / "report", learned=False).read_text()
     assert FITTED_TO_ALL in page and "training and validation recordings together" in page
-    # What stands large at the top is the error of the model to use on test data.
+    # The error at the top of the page is that of the model to use on test data.
     top = page[page.index("error over 2 s of test data") :]
     shown = next(float(x) for x in re.findall(r"→ </span>([\d.]+) deg", top))
     assert shown == pytest.approx(np.rad2deg(short_runs_miss(found.model, runs[2])), rel=0.01)
 
 
 def test_runs_that_validate_each_other(runs, arm):
-    """The search has fitted all of them already, but with fitted first states."""
+    """The search has fitted all runs already, but with fitted first states."""
     found = rf.discover(arm + Coulomb("hub", level=0.02), list(runs), candidates=[], rounds=0)
     last = found.final_fit
     assert found.verdict == "unexplained" and last is not None
     assert 0.05 < level_of(found.model) < 0.08
-    # A fit without a run misses it by the difference of its friction, the fit to all by less.
+    # Friction differs between runs, so a fit without a run has a larger error on it than the fit to all.
     seen = np.sqrt(np.mean([short_runs_miss(found.model, r) ** 2 for r in runs]))
     assert last.trained.windows["theta"] > seen
 
 
 def test_what_recordings_know_is_theirs(arm, monkeypatch):
-    """An inertia that is a constant of each recording: the fit and its errors have that of each."""
+    """The inertia is a constant of each recording; the fit and its errors use the value of each."""
     inertia, given = "hub.inertia.inertia", []
     for seed, (level, J) in enumerate(((0.05, 0.0075), (0.075, 0.012), (0.07, 0.02))):
         monkeypatch.setitem(globals(), "INERTIA", J)
@@ -591,7 +606,7 @@ def test_what_recordings_know_is_theirs(arm, monkeypatch):
     ],
 )
 def test_a_clearly_worse_way_is_not_taken(runs, arm, monkeypatch, share, said):
-    """Errors of the way, tried on the training recording, just below and just above the limit."""
+    """Errors on validation data of the fit to training data are set just below or above the limit."""
     train, validation, _ = runs
     search = lambda: rf.discover(  # noqa: E731
         arm, train, validation, candidates=[], rounds=0, calibrate_seconds=0.0
@@ -603,7 +618,7 @@ def test_a_clearly_worse_way_is_not_taken(runs, arm, monkeypatch, share, said):
         return RunErrors({"theta": 0.0}, {"theta": 0.9 * theirs})
 
     def alone(last, structures):
-        # With fitted first states it is worse still; what is said is of measured ones.
+        # With fitted first states the errors are larger still; the note has those with measured ones.
         error = {"measured": limit, "fitted": 3 * limit}
         return [
             t._replace(errors=RunErrors({"theta": 0.0}, {"theta": error[t.structure.first]}))
@@ -618,7 +633,7 @@ def test_a_clearly_worse_way_is_not_taken(runs, arm, monkeypatch, share, said):
 
 
 def test_where_measured_first_states_do_worse_the_fit_is_with_fitted_ones(runs, arm, monkeypatch):
-    """As the search fits, from its parameters alone, and to all recordings: friction of both runs counts."""
+    """It equals `rf.fit` to both recordings; the search, fitted to one of them, has less friction."""
     train, validation, test = runs
     tried = MODULE._FinalFitBuilder.tried
 
@@ -663,6 +678,7 @@ def test_errors_that_differ_by_less_than_a_tenth_are_not_distinguished(runs, arm
 
 
 def test_a_fit_that_has_failed_is_not_handed_on(runs, arm, monkeypatch):
+    """A fit to all recordings with large errors on them, here by a wrong inertia, is refused with a note."""
     train, validation, _ = runs
     fit = STRUCTURE.fit
 
@@ -681,6 +697,8 @@ def test_a_fit_that_has_failed_is_not_handed_on(runs, arm, monkeypatch):
 
 
 def test_what_cannot_be_fitted_costs_nothing_else(runs, arm, monkeypatch):
+    """If the recordings cannot be fitted together, the result of the search remains, with a note."""
+
     def refuse(model, recordings, **how):
         raise rf.InputError("One channel does not move.")
 
@@ -693,7 +711,7 @@ def test_what_cannot_be_fitted_costs_nothing_else(runs, arm, monkeypatch):
 
 
 def test_of_many_runs_each_third_is_left_out(monkeypatch):
-    """Each is validated by a fit without it."""
+    """Five runs give three fits, and each run is validated by a fit without it."""
 
     def fit_structures(asked):
         return [
@@ -731,12 +749,12 @@ COULOMB_HUB, LAG, COGGING, BIAS, LUGRE_HUB = (
 
 
 def fewer_effects(needed=(), spoken_for=(), refused=()):
-    """What becomes of friction, lag, cogging and a bias, where LuGre friction took the place of Coulomb's.
+    """Elimination from a model with LuGre friction in the place of Coulomb's, a lag, cogging and a bias.
 
     Args:
-        needed: Effects with which free runs of all recordings are better.
-        spoken_for: Those without which runs of validation data are worse by more than a tenth.
-        refused: Those without which the fit would not be accepted.
+        needed: Effects with which free runs of all recordings are clearly better.
+        spoken_for: Effects without which runs of validation data are worse by more than a tenth.
+        refused: Effects without which the fit is refused.
     """
     said, every = [], (LUGRE_HUB, LAG, COGGING, BIAS)
 
@@ -748,7 +766,7 @@ def fewer_effects(needed=(), spoken_for=(), refused=()):
 
     def tried(structures):
         (structure,) = structures
-        assert structure.start == "training"  # a fit to all uses the validation data
+        assert structure.start == "training"  # a start fitted to all recordings would use validation data
         lost = 0.15 if set(spoken_for) - set(structure.on) else 0.0
         errors = RunErrors({}, {"theta": np.exp(lost)})
         return [MODULE._Tried([fitted(structure.on, "training")], errors)]
@@ -770,7 +788,7 @@ def fewer_effects(needed=(), spoken_for=(), refused=()):
 
 
 def test_effects_that_free_runs_hardly_need_are_not_in_the_model_to_use():
-    """The last one is tried first; the first one and calibrations are not tried."""
+    """The effect found last is tried first; the first effect and calibrations always stay."""
     found, said, _ = fewer_effects()
     assert said == [f"  without {p}" for p in (COGGING, LAG)]
     assert found.left_out == (COGGING, LAG) and found.fitted.structure.on == (LUGRE_HUB, BIAS)
@@ -784,6 +802,7 @@ def test_an_effect_that_data_need_stays(reason):
 
 
 def test_of_a_law_in_the_place_of_one_that_was_found_that_one_is_left_out():
+    """If a law is left out, the effects that it had replaced are listed, and not the law itself."""
     candidate, _, last = fewer_effects(needed=[LAG, COGGING])
     delays = EffectLocation("delay", "input"), EffectLocation("channel_delay", "alpha")
     candidate = candidate._replace(laws=tuple((p, LAG) for p in delays))

@@ -20,7 +20,7 @@ def everything(e: np.ndarray) -> np.ndarray:
 
 
 def log_likelihood(e: np.ndarray, seen: np.ndarray, floor: np.ndarray) -> float:
-    """Of innovations under the whitener that is fitted to them."""
+    """Log-likelihood of innovations under the whitener that is fitted to them."""
     return float(fit_whitener(e, seen, floor).log_densities(e, seen).sum())
 
 
@@ -44,7 +44,7 @@ def test_what_is_not_seen_does_not_count():
     seen = everything(e)
     seen[1, 200:] = 0
     other = e.copy()
-    other[1, 200:] = 77.0  # the mask decides, whatever stands there
+    other[1, 200:] = 77.0  # masked values have no influence
     e[1, 200:] = 0.0
     a, b = (fit_whitener(x * seen[..., None], seen, FLOOR) for x in (e, other))
     np.testing.assert_array_equal(a.L, b.L)
@@ -66,7 +66,7 @@ def test_no_other_whitener_is_likelier():
 
 
 def test_slopes_are_whitened_like_innovations():
-    """Any leading axes; and the whitener is linear."""
+    """The whitener is linear, and its argument may have any leading axes."""
     e, J = white(N=100), np.random.default_rng(4).normal(size=(3, 2, 100, 2))
     seen = everything(e)
     w = fit_whitener(e, seen, FLOOR)

@@ -1,4 +1,4 @@
-"""Other laws in the places of what was found, where the model leaves much: which of them remain."""
+"""Other laws in the places of effects of a poor final model, and rivals that remain possible."""
 
 import dataclasses
 import functools
@@ -37,19 +37,22 @@ def test_laws_of_one_thing_at_one_port():
     assert s.other_laws(STRIBECK) == [COULOMB, DAHL, LUGRE]
     assert s.other_laws(ARM) == []
     assert s.other_laws(LAG) == [DELAY]
-    # Two of nothing that is a law of the same thing have nothing in common.
+    # These effects are no laws of one thing.
     assert s.other_laws(DEAD_ZONE) == s.other_laws(SHAKING) == []
 
 
 def model(*locations: EffectLocation) -> ValidatedHypothesis:
-    """A structure, without numbers."""
+    """A validated model with these effects, without parameter values."""
     h: Any = SimpleNamespace(locations=locations)
     v = ValidatedHypothesis(h, np.zeros(1), h, np.ones(1))
     return dataclasses.replace(v, free_run=v)
 
 
 def test_all_laws_and_rivals_take_the_place_once(monkeypatch: pytest.MonkeyPatch):
-    """What was found elsewhere takes no place, what was fitted before is known, a line has passed already."""
+    """Effects of the model are not tried, and models that are known are not fitted again.
+
+    A periodic disturbance remains a rival without a fit.
+    """
     final, known = model(STRIBECK, DELAY), model(DAHL, DELAY)
     begun: dict[EffectLocation, tuple] = {}
     asked: list[EffectLocation] = []
@@ -91,7 +94,7 @@ def test_all_laws_and_rivals_take_the_place_once(monkeypatch: pytest.MonkeyPatch
     assert sorted(asked) == sorted([*begun, DAHL])
     for location, (left, runs_left, c) in begun.items():
         assert left == runs_left == ((STRIBECK,) if location == LAG else (DELAY,))
-        # The largest of each number in a shape; all shapes.
+        # The largest value of each parameter in a shape, for all shapes.
         np.testing.assert_array_equal([c.values, *c.others], [[1.0, 2.0], [3.0, 4.0]])
     assert [line.startswith("  fitting ") for line in lines].count(False) == len(asked)
 
@@ -120,14 +123,17 @@ def test_a_law_that_data_prefer_takes_the_place(monkeypatch: pytest.MonkeyPatch)
     assert list(state.scores.items()) == [(DELAY, 2.0), (LUGRE, 1.0)]
     assert list(state.gains.items()) == [(DELAY, "a"), (LUGRE, "b")]
     assert state.rivals == {DELAY: [LAG], LUGRE: [STRIBECK, COULOMB]}
-    # One that they do not prefer leaves all as it is.
+    # A law that the data do not prefer changes nothing.
     monkeypatch.setattr(in_place, "better_in_place", lambda rival, found, measured: False)
     assert in_place.take_better_laws(state) == () and state.current.hypothesis is best.hypothesis
 
 
 @pytest.mark.parametrize("predictions", [True, False])
 def test_a_shape_at_a_bound_is_that_of_another_law(predictions: bool, monkeypatch: pytest.MonkeyPatch):
-    """Where a horizon prefers the law. A level of zero is no shape: it is the law switched off."""
+    """The fit to predictions counts only if predictions prefer the law.
+
+    A level of zero does not count as a bound, since it is no shape parameter.
+    """
     monkeypatch.setattr(in_place, "predictions_apart", lambda rival, found: predictions)
     specs = specifications(fx.LuGre)
     assert list(specs) == ["level", "rise", "slow", "presliding", "damping"]
@@ -160,7 +166,7 @@ LAW, BESIDE = ("stribeck", "hub"), ("slack_cable", "hub")
 
 
 def found_beside(size: float) -> Discovery:
-    """A search on a machine with Stribeck friction and a cable of some size that nothing describes."""
+    """A search on a machine with Stribeck friction and a slack cable, which no candidate describes."""
     hidden = {LAW: {"level": 0.02, "excess": 0.02, "speed": 0.5}}
     record = make_record(hidden | ({BESIDE: size} if size else {}), seed=2100, seconds=7.0, fs=500.0)
     train, validation = rf.Recording(u=record["u"], y=record["y"], Ts=record["Ts"]).split(0.7)
@@ -184,8 +190,8 @@ def test_a_law_stands_where_the_one_that_it_replaced_was_added(monkeypatch: pyte
     state = SearchState(Any, Any, lambda line: None, None)
     state.scores = dict.fromkeys([ARM, COULOMB, DEAD_ZONE, DELAY, LUGRE], 1.0)
     assert state.in_order([ARM, DEAD_ZONE, DELAY, LUGRE]) == [ARM, LUGRE, DEAD_ZONE, DELAY]
-    # Beside the one before it, it is a discovery of its own.
+    # If the earlier law is still in the model, the later one is a separate effect.
     assert state.in_order([COULOMB, DEAD_ZONE, DELAY, LUGRE]) == [COULOMB, DEAD_ZONE, DELAY, LUGRE]
-    # One at another place, or of another thing, is none that it replaced.
+    # It has replaced neither an effect at another port nor one that is no law of the same thing.
     assert state.in_order([COULOMB, DELAY]) == [COULOMB, DELAY]
     assert state.in_order([DEAD_ZONE, LUGRE, SHAKING]) == [LUGRE, DEAD_ZONE]

@@ -52,7 +52,7 @@ def test_splines_are_those_of_scipy():
         pair.append(BSpline.design_matrix(x, knots, 3).toarray())
     expected = np.einsum("ki,kj->kij", *pair).reshape(50, -1)
     np.testing.assert_allclose(MAP.design(q, w), expected, atol=1e-12)
-    # Outside of its ranges a map stays what it is at their end.
+    # Outside its ranges a map has its value at their end.
     np.testing.assert_allclose(
         MAP.design(np.array([9.0]), np.array([-7.0])), MAP.design(np.array([2.0]), np.array([-3.0]))
     )
@@ -114,7 +114,7 @@ def test_penalties_are_squared_differences():
 
 
 def information(J: np.ndarray, r: np.ndarray, physics: np.ndarray, excess: float = 1.0) -> MapEquations:
-    """Of residuals `r + J c + physics a` with nothing fitted yet."""
+    """Equations of residuals `r + J c + physics a` at parameters of zero."""
     W, n = np.hstack([physics, J]), physics.shape[1]
     indices = np.arange(W.shape[1])
     return MapEquations(W.T @ W, W.T @ r, indices[:n], indices[:n], indices[n:], 0.5 * float(r @ r), excess)
@@ -131,7 +131,7 @@ def test_smoothness_is_of_largest_likelihood():
     basis = np.linalg.svd(np.eye(N) - physics @ np.linalg.pinv(physics))[0][:, : N - 2]
 
     def cost(logs):
-        """Less log-likelihood of what the physics cannot reach, weights integrated out."""
+        """Negative log-likelihood of the part orthogonal to the physics, with weights integrated out."""
         prior = np.linalg.inv(np.einsum("i,ijk->jk", np.exp(logs), np.array(S)))
         C, e = basis.T @ (Phi @ prior @ Phi.T) @ basis + np.eye(N - 2), basis.T @ r
         return 0.5 * (np.linalg.slogdet(C)[1] + e @ np.linalg.solve(C, e))
@@ -185,7 +185,7 @@ def test_a_formula_is_read_in_noise_beside_a_damper(law, wanted):
     N = 3000
     q, w = rng.uniform(-1, 2, N), rng.normal(scale=1.2, size=N).clip(-3, 4)
     effect = dataclasses.replace(MAP, count=(9, 17), bend=0.1, scale=0.02, weights=())
-    # What each torque does to the outputs: here simply itself, in units of the noise.
+    # The outputs are the torque itself, in units of the noise.
     noise, design = 0.01, effect.design(q, w)
     r = -law(q, w) / noise + rng.normal(size=N)
     physics = np.stack([w, np.ones(N)], axis=1) / noise
@@ -197,7 +197,7 @@ def test_a_formula_is_read_in_noise_beside_a_damper(law, wanted):
         )
     if wanted:
         assert found.share > 0.85
-        # What a damper can hold is not the formula's.
+        # A line in the speed is left to the damper, so it is subtracted.
         slope = np.polyfit(w, law(q, w) - found(q, w), 1)
         assert np.std(law(q, w) - found(q, w) - np.polyval(slope, w)) < 0.15 * np.std(law(q, w))
 
@@ -231,7 +231,7 @@ def taught(effects=(), seed: int = 101, **given):
 
 @pytest.fixture(scope="module")
 def small_map():
-    """Speed alone, so that little is compiled."""
+    """Maps of the speed alone, which are compiled faster."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(learned, "SPLINES", (1, 13))
         yield
@@ -250,7 +250,7 @@ def test_friction_is_learned_and_read(friction):
         assert found.after.held_out_rmse_windows[channel] < 0.3 * before
     (term,) = found.formula.terms
     assert term.name == "sign(w)" and term.coefficient == pytest.approx(-0.03, rel=0.08)
-    # The map is the step less the line that the damper took over, within its band over most of the range.
+    # The map is the friction less the line that the damper has taken over, mostly within its band.
     w = np.linspace(*np.quantile(found.speed, (0.05, 0.95)), 60)
     w = w[np.abs(w) > 0.3]
     mean, std = found.torque(np.zeros(len(w)), w)

@@ -1,4 +1,4 @@
-"""Batched least squares against SciPy's, what a refit must never do, and the discretisation bias."""
+"""Batched least squares against SciPy's, properties of every refit, and the discretisation bias."""
 
 import dataclasses
 
@@ -44,7 +44,7 @@ def rough():
 
 
 def with_friction(problem, level: float):
-    """The true structure, friction free."""
+    """The true structure; the friction, which starts at this level, is a free parameter."""
     s, h = problem.supermodel, sp.start(problem, wrong=0.05)
     i = s.parameter_indices(sp.HUB)[0]
     z = h.z.copy()
@@ -54,7 +54,7 @@ def with_friction(problem, level: float):
 
 
 def at(h, numbers: np.ndarray):
-    """The hypothesis at other numbers: common, then for each recording its own and its first state."""
+    """The hypothesis with other parameters: common ones, then local ones and first states by recording."""
     shared, R = len(h.free), len(h.x0)
     z = h.z.copy()
     z[list(h.free)] = numbers[:shared]
@@ -72,7 +72,7 @@ def cost(problem, h, whitener) -> float:
 
 
 def test_slopes_are_those_of_the_innovations(rough):
-    """Every direction that a fit moves, against differences."""
+    """Derivatives by all parameters and first states of a fit, against central differences."""
     h = with_friction(rough, 0.02)
     h = rough.with_process_noise(h, {"hub": 1e-4 * rough.dataset.torque_scale**2 * 0.0025, "joint": 1e-9})
     own = np.array([[0.01, 0.002], [-0.02, 0.001]])
@@ -82,11 +82,11 @@ def test_slopes_are_those_of_the_innovations(rough):
     point, shared, each, step = numbers_of(h), len(h.free), h.moved - len(h.free), 1e-6
     for k in range(h.moved):
         nudge = np.zeros_like(point)
-        # Local numbers and first states move in both recordings together.
+        # Local parameters and first states are changed in both recordings together.
         nudge[[k] if k < shared else [k, k + each]] = step
         e = rough.innovations([at(h, point + way * nudge) for way in (1, -1)])
         expected = (e[0] - e[1]) / (2 * step)
-        # Friction switches at a sample here and there; differences see that as a jump.
+        # At a few samples the sign of friction changes, which makes a jump in the differences.
         close = np.abs(J[0, k] - expected) < 1e-4 * np.abs(expected).max()
         assert close.mean() > 0.98, k
 
@@ -145,14 +145,14 @@ def test_the_optimum_is_that_of_scipy(rough, intensity):
         return h.whitener(e, seen).ravel()
 
     def slopes(numbers):
-        """By differences, several at a time."""
+        """Forward differences, all in one batch."""
         step = 1e-6
         nudged = [at(h, numbers + step * row) for row in np.eye(len(numbers))]
         e = rough.innovations([at(h, numbers), *nudged])
         w = h.whitener(e, seen).reshape(len(e), -1)
         return (w[1:] - w[0]).T / step
 
-    # From the other side, so that the two do not share a path.
+    # From another start, so that the two fits take different paths.
     start = numbers_of(found) + 0.02
     best = least_squares(residuals, start, jac=slopes, x_scale="jac", xtol=1e-10, ftol=1e-10)
     assert cost(rough, found, h.whitener) < best.cost + 0.5
@@ -188,7 +188,7 @@ def test_the_truth_is_recovered(rough):
     level = s.parameter_indices(sp.HUB)[0]
     bias = s.parameter_indices(EffectLocation("voltage_offset", "input"))[0]
     assert values[0, level] == pytest.approx(0.02, rel=0.05)
-    # Each recording has an offset of its own; the numbers of the machine are common.
+    # Each recording has its own offset; the parameters of the machine are common.
     np.testing.assert_allclose(values[:, bias], [0.02, -0.02], atol=0.006)
     assert np.ptp(values[:, list(found.free)], axis=0).max() == 0
 
@@ -210,7 +210,7 @@ def test_the_likelihood_never_falls(rough):
 
 
 def test_no_step_raises_the_cost(rough):
-    """Also from so far off that a whole step leads astray."""
+    """Also from starts so far away that a full step raises the cost."""
     starts = [sp.start(rough, wrong=-0.7), sp.start(rough, wrong=5.0)]
     costs = [[cost(rough, h, h.whitener) for h in starts]]
     for steps in (1, 2, 4, 8, 12):
@@ -241,7 +241,7 @@ def test_process_noise_is_nil_where_the_model_is_right_and_not_where_it_is_wrong
     assert moved.log_likelihood > wrong.log_likelihood + 100
     for h in (settled, moved):
         assert all(least <= q <= most for q in h.process_noise.values())
-    # The gain is that of the intensity it names.
+    # The gain belongs to the intensity that is reported.
     np.testing.assert_allclose(rough.gains(moved, [moved.process_noise])[0], moved.K, rtol=1e-9)
 
 
@@ -264,7 +264,7 @@ def test_grid_of_intensities():
 
 
 def test_a_start_from_which_nothing_is_finite_is_left_alone(rough):
-    """Numbers that overflow stay the unlikeliest, and do not stop the others."""
+    """Its log-likelihood becomes minus infinity, and other fits are not affected."""
     good, bad = with_friction(rough, 0.01), sp.start(rough)
     bad = dataclasses.replace(bad, x0=np.full((2, 1, 4), np.nan))
     one, other = levenberg_marquardt(rough, [good, bad])
@@ -275,15 +275,15 @@ def test_a_start_from_which_nothing_is_finite_is_left_alone(rough):
 @pytest.mark.parametrize(
     ("gains", "alternations", "taken"),
     [
-        ([40, 0.5, 99], 3, 2),  # settled
-        ([300, 200, 100, 80, 60, 5, 99], 3, 6),  # far from settled after three: goes on while it gains much
-        ([300, 200, 3, 99], 3, 3),  # a little left after three
+        ([40, 0.5, 99], 3, 2),  # converged
+        ([300, 200, 100, 80, 60, 5, 99], 3, 6),  # not converged after three: continues while it gains much
+        ([300, 200, 3, 99], 3, 3),  # little is left after three
         ([99], 0, 0),
-        ([50] * 40, 1, 1 + EXTRA_ALTERNATIONS),  # not for ever
+        ([50] * 40, 1, 1 + EXTRA_ALTERNATIONS),  # limited
     ],
 )
 def test_a_refit_is_not_stopped_on_its_way(monkeypatch, plain, gains, alternations, taken):
-    """Scripted turns: which of them are taken."""
+    """The number of alternations, where the gain of each is prescribed."""
     problem, h = plain
     left = iter(gains)
     start = dataclasses.replace(h, densities=np.zeros((2, 1)))
@@ -303,7 +303,7 @@ def test_a_refit_is_not_stopped_on_its_way(monkeypatch, plain, gains, alternatio
 
 @pytest.mark.parametrize("late", [Delay(time=0.0045), Delay(time=0.004), Lag(time=0.006), Lag(time=0.0007)])
 def test_a_late_voltage_moves_a_mass_as_far_as_it_should(late):
-    """Both hold the impulse and come late by `time` in the mean: a free mass ends where that says."""
+    """Delay and lag keep the impulse and shift its mean by `time`, so the end of a free mass is known."""
     Ts, N = 0.002, 400
     u = np.zeros(N)
     u[5:45] = np.random.default_rng(0).normal(size=40)
@@ -356,7 +356,7 @@ def test_a_part_knows_what_came_before_it():
 
 
 def test_a_warm_motor_stays_warm_in_the_second_part():
-    """The second part of a run is a run of its own, but for the heat that the first one left."""
+    """The second part of a run starts with the heat of the first, which reduces its error to 2 % or less."""
     model = rf.Model(rf.joints.paper() + Heating(at="hub", rate=3.0, time=30.0))
     rng = np.random.default_rng(1)
     u = np.repeat(2 * rng.normal(size=60), 20)

@@ -1,4 +1,4 @@
-"""Errors that are put somewhere are found there, and errors that are nowhere are found nowhere."""
+"""Errors placed at some times, speeds or deflections are located there; evenly spread errors are not."""
 
 import dataclasses
 
@@ -24,7 +24,7 @@ def smooth(rng: np.random.Generator, N: int, cutoff: float, Ts: float) -> np.nda
 
 
 def recording(seed: int = 0, N: int = 4000, Ts: float = 0.004, **named) -> Recording:
-    """A joint that moves at random, and slowly enough to reverse about once a second."""
+    """Random motion of a joint that is slow enough to reverse about once a second."""
     rng = np.random.default_rng(seed)
     theta, alpha = 0.5 * smooth(rng, N, 0.8, Ts), 0.1 * smooth(rng, N, 2.5, Ts)
     y = np.column_stack([theta, alpha]) + 1e-4 * rng.standard_normal((N, 2))
@@ -41,7 +41,7 @@ def white(rec: Recording, seed: int = 1, size: float = 1e-3) -> np.ndarray:
 
 
 def reversals(rec: Recording) -> np.ndarray:
-    """Samples at which the noise-free hub turns round, by another route than the code's."""
+    """Samples at which the hub reverses, by a moving average and not by the local polynomial of the code."""
     speed = np.gradient(np.convolve(rec.channel("theta"), np.ones(15) / 15, mode="same"))
     return np.flatnonzero(speed[1:] * speed[:-1] < 0) + 1
 
@@ -84,7 +84,7 @@ def test_speed_and_deflection_are_named(moving, kind, phrase, where) -> None:
 
 
 def test_a_carried_error_is_traced_to_where_it_arises(moving) -> None:
-    # A torque error beyond 9 degrees is integrated twice: it shows in all samples, but arises there.
+    # A torque error beyond 9 degrees is integrated twice: its effect is in all samples, but arises there.
     alpha = moving.channel("alpha")
     push = np.where(np.abs(alpha) > np.deg2rad(9), np.sign(alpha), 0.0)
     push = push - push.mean()
@@ -101,7 +101,7 @@ def test_restarted_runs_do_not_hide_where_an_error_arises(moving) -> None:
     e = white(moving)
     e[np.abs(moving.channel("alpha")) > 0.15, 0] *= 4.0
     starts = np.arange(0, moving.N, 500)
-    for k in starts:  # every window starts with an error of its own
+    for k in starts:  # every window starts with another error
         e[k : k + 500, 0] += 0.3 * (-1) ** (k // 500)
     told = locate(moving, e, moving.channels, NOISE, window_seconds=2.0)
     assert any("arises while the deflection is beyond" in w.statement for w in told)
@@ -119,7 +119,7 @@ def test_noise_at_standstill_is_no_reversal() -> None:
     noise = {"theta": 1e-3, "alpha": 1e-3}
     view = next(v for v in condition_sets(rec, rec.channels, noise, None) if v.kind == "reversal")
     just_after = np.flatnonzero(np.diff(view.bins, prepend=view.bins[0]) < 0)
-    # The fifth is where the motion stops dead and the filter swings.
+    # A fifth one is possible at the abrupt stop, where the smoothed speed overshoots.
     assert rec.t[just_after[:4]] == pytest.approx([0.5, 1.5, 2.5, 3.5], abs=0.03)
     assert len(just_after) <= 5
 
@@ -165,10 +165,10 @@ def test_an_error_that_is_nowhere_is_found_nowhere(tau) -> None:
         a = np.exp(-rec.Ts / tau) if tau else 0.0
         e = lfilter([1.0], [1.0, -a], rng.standard_normal((rec.N + 500, 2)), axis=0)[500:]
         told = locate(rec, 1e-3 * e, rec.channels, NOISE)
-        # Coloured noise truly has more low frequencies than a sensor.
+        # Coloured noise has more power at low frequencies than white sensor noise, which is no false alarm.
         found = [w for w in told if len(w.edges) and w.kind != "frequency"]
         false += bool(found)
-    assert false <= 6  # of 60; seven or more have a chance of 3 % at the nominal 5 %
+    assert false <= 6  # of 60; seven or more have a probability of 3 % at the nominal 5 %
 
 
 def test_p_values_are_uniform_without_a_place(moving) -> None:
@@ -232,7 +232,7 @@ def test_one_channel_and_noise_as_an_array() -> None:
 @pytest.mark.parametrize("named", [True, False], ids=["by the machine", "by its unit"])
 @pytest.mark.parametrize("place", [0, 1])
 def test_a_current_is_no_motion(place: int, named: bool) -> None:
-    """Beside a current, wherever it stands among the channels, the angle alone tells speed and deflection."""
+    """Beside a current, which may be any channel, speed and deflection are those of the angle alone."""
     both = recording()
     rng = np.random.default_rng(5)
     current, theta = smooth(rng, both.N, 3.0, both.Ts), both.channel("theta")
@@ -251,9 +251,9 @@ def test_a_current_is_no_motion(place: int, named: bool) -> None:
     assert {v.channel for v in conditions} == set(names)
     for v in conditions:
         assert " A" not in v.statement and "current moves" not in v.statement
-        assert v.channel != "current" or "arises" not in v.statement  # its error is not carried on
+        assert v.channel != "current" or "arises" not in v.statement  # its error is not integrated
     assert any("while the hub turns slower than" in v.statement for v in conditions)
-    # Of a recording of readings alone nothing turns or deflects.
+    # A recording without a position or speed has no conditions.
     alone = Recording(u=both.u, y=current, Ts=both.Ts, channels="current", units="A")
     assert condition_sets(alone, ("current",), {"current": 1e-4}, None) == ()
 
@@ -276,7 +276,7 @@ def test_a_speed_beside_an_angle_does_not_deflect() -> None:
 
 
 def test_the_error_of_a_speed_arises_with_its_first_derivative() -> None:
-    """Kicks to the speed at reversals decay slowly, so that the error lies everywhere and arises there."""
+    """Steps of the error at reversals decay slowly, so the error is everywhere but arises at reversals."""
     both = recording()
     speed = smooth(np.random.default_rng(6), both.N, 0.8, both.Ts)
     rec = Recording(u=both.u, y=speed, Ts=both.Ts, channels="tacho", units="rad/s")

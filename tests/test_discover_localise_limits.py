@@ -1,4 +1,4 @@
-"""Each limit of the statements on where an error lies, from both sides; the limits are written out here."""
+"""Each limit of the statements on where an error lies, tested from both sides with its value."""
 
 from types import SimpleNamespace
 from typing import Any
@@ -32,7 +32,7 @@ def test_signals_are_smoothed_over_30_ms_and_three_samples_to_each_side(N: int, 
 
 
 def test_the_acceleration_of_a_parabola_is_known_between_the_jumps() -> None:
-    rec = record(200)  # seven samples at a time
+    rec = record(200)  # smoothed over seven samples
     t = np.arange(200) * 0.01
     error = 1.5 * t**2 - 0.3 * t + 7.0
     for order, expected in ((2, np.full(200, 3.0)), (1, 3 * t - 0.3)):
@@ -47,17 +47,20 @@ def test_the_acceleration_of_a_parabola_is_known_between_the_jumps() -> None:
 @pytest.mark.parametrize(("share", "moves"), [(0.999, True), (1.001, False)])
 def test_what_moves_is_five_times_its_error(share: float, moves: bool) -> None:
     x = np.where(RNG.random(400) < 0.5, 1.0, -1.0)
-    x[:6] = 30.0  # two in a hundred may be further
+    x[:6] = 30.0  # 2 % of the samples may be further away
     found = localise._sides("speed", x, "m/s", share / 5, WORDS)
     assert (found is not None) == moves
     assert found is None or found.edges[-1] == pytest.approx(1.0)  # ten steps of a tenth, no fewer
     assert localise._sides("speed", np.zeros(400), "m/s", -1.0, WORDS) is None
-    assert localise._sides("speed", np.where(x > 0, 1.0, -1.0), "m/s", 0.2, WORDS) is None  # five times it
+    assert localise._sides("speed", np.where(x > 0, 1.0, -1.0), "m/s", 0.2, WORDS) is None  # exactly 5 times
 
 
 @pytest.mark.parametrize(("unit", "factor", "step"), [("V", 1.0, 0.1), ("rad", 180 / np.pi, 5.0)])
 def test_conditions_hold_where_they_say(unit: str, factor: float, step: float) -> None:
-    """An eighth of what is reached, a round number in the unit that is read; for 3 to 60 % of the time."""
+    """Limits are multiples of a round number near an eighth of the reach, in the unit that people read.
+
+    Only conditions that hold for 3 to 60 % of the time are kept.
+    """
     x = np.concatenate([np.linspace(-0.83, 0.87, 1700), np.tile(0.1 * np.arange(-8, 9), 10)])
     reach = float(np.quantile(np.abs(x), 0.98))
     found = localise._sides("deflection", x, unit, 0.0, WORDS)
@@ -85,7 +88,7 @@ def test_a_condition_holds_for_three_to_sixty_hundredths_of_the_time(held: int, 
 
 
 def turning(back: float, error: float) -> ConditionSet | None:
-    """A speed of one that is negative twice, for a twentieth of a second, at 4 s and at 8 s."""
+    """Conditions for a speed of 1 that is negative twice for 0.05 s, at 4 s and at 8 s."""
     speed = np.ones(1200)
     speed[400:405] = speed[800:805] = -back
     return localise._reversals(speed, error, 0.01, "the hub")
@@ -96,10 +99,10 @@ def turning(back: float, error: float) -> ConditionSet | None:
 def test_a_reversal_is_three_hundredths_of_the_speed_and_four_times_its_error(
     share: float, turns: bool, error: float
 ) -> None:
-    """The root mean square of the speed is one but for what the few samples make of it."""
+    """The root mean square of the speed is nearly sqrt(1190 / 1200), without the ten negative samples."""
     limit = max(4 * error, 0.03 * np.sqrt(1190 / 1200))
     assert (turning(share * limit, error) is not None) == turns
-    assert turning(0.5, 0.125) is None  # no more than four times the error
+    assert turning(0.5, 0.125) is None  # exactly four times the error
 
 
 def test_times_after_a_reversal() -> None:
@@ -110,7 +113,7 @@ def test_times_after_a_reversal() -> None:
         since[k:] = 0.01 * np.arange(1200 - k)
     times = (0.02, 0.04, 0.08, 0.12, 0.2, 0.3, 0.5)
     masks = {f"within {1e3 * h:.0f} ms after the hub reverses": since < h - 1e-9 for h in times}
-    # Less than 3 % of the time is left out.
+    # Conditions for less than 3 % of the time are left out.
     masks = {k: m for k, m in masks.items() if m.mean() >= 0.03}
     assert list(masks) == list(found.phrases) and 0 < len(masks) < len(times)
     np.testing.assert_array_equal(found.masks, list(masks.values()))
@@ -126,7 +129,10 @@ def share_of(share: float, expected: float, p: float, kind: str = "speed") -> Er
 
 
 def test_several_comparisons_are_corrected_for() -> None:
-    """Of n the k-th smallest may be 0.05 k / n (Benjamini and Hochberg); smaller ones pass with it."""
+    """Of n p-values the k-th smallest may be at most 0.05 k / n (Benjamini and Hochberg).
+
+    Then all smaller ones pass as well.
+    """
     for side, passed in ((0.999, 3), (1.001, 0)):
         p = [0.9, 0.05 * 3 / 5 * side, 0.0299, 0.7, 0.0298]
         assert len(localise._significant([share_of(0.5, 0.1, x) for x in p])) == passed
@@ -139,7 +145,7 @@ def test_several_comparisons_are_corrected_for() -> None:
 def test_a_share_is_told_if_it_is_eight_hundredths_and_a_third_more(
     expected: float, least: float, side: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """0.08 more than expected, and 1.3 times as much."""
+    """The share is at least 0.08 more than expected, and at least 1.3 times the expected share."""
     nothing = share_of(0.1, 0.1, 1.0)
     found = share_of(least + side, expected, 1e-9)
     monkeypatch.setattr(localise, "condition_sets", lambda *given: ())
@@ -181,7 +187,10 @@ def test_a_hundredth_at_an_end_is_no_piece_of_its_own(start: int, stop: int, sai
 
 
 def test_the_significance_in_time_is_that_of_kuiper() -> None:
-    """2 sum (4 j^2 v^2 - 1) exp(-2 j^2 v^2), of a walk whose range is known; white errors sum over no lag."""
+    """The p-value is 2 sum (4 j^2 v^2 - 1) exp(-2 j^2 v^2), computed here.
+
+    v is the range of the cumulative sum of the squared error less its mean, over its standard deviation.
+    """
     rec, rng = record(1000), np.random.default_rng(8)
     for seed in range(5):
         e = np.random.default_rng(seed).standard_normal(1000) * np.where(np.arange(1000) < 500, 1.0, 1.15)
@@ -192,13 +201,16 @@ def test_the_significance_in_time_is_that_of_kuiper() -> None:
         v = np.ptp(np.append(0.0, np.cumsum(d))) / np.sqrt(spread)
         p = 2 * sum((4 * j**2 * v**2 - 1) * np.exp(-2 * j**2 * v**2) for j in range(1, 100))
         assert localise.in_time("theta", e, rec).where.p_value == pytest.approx(min(p, 1.0), rel=1e-6)
-    # A range of the walk below what chance leaves is certain, whatever the series makes of it.
+    # For a range far below that of random errors, where the series is inaccurate, p is a probability too.
     flat = np.where(np.arange(1000) % 2, 1.0, -1.0) * (1 + 1e-9 * rng.standard_normal(1000))
     assert 0.0 <= localise.in_time("theta", flat, rec).where.p_value <= 1.0
 
 
 def test_bands_hold_their_share_of_the_power() -> None:
-    """Of 1, 2 and 5 times powers of ten, from four times the lowest frequency on; white noise is even."""
+    """Edges are 1, 2 and 5 times powers of ten, from four times the lowest frequency on.
+
+    Expected shares are those of white noise.
+    """
     rec = record(1000)  # 0.1 to 50 Hz
     e = np.random.default_rng(9).standard_normal(1000) + 0.5 + np.sin(2 * np.pi * 3.0 * rec.t)
     found = localise.in_frequency("theta", e, rec, "m")
@@ -252,7 +264,7 @@ def test_the_deflection_is_the_parabola_through_seven_samples() -> None:
 
 @pytest.mark.parametrize("Ts", [0.01, 0.002])
 def test_a_speed_is_smoothed_over_the_half_width_to_each_side(Ts: float) -> None:
-    """A jump between two samples is seen by the windows that hold both."""
+    """A jump between two samples changes the speed in all windows that contain both."""
     y = np.where(np.arange(400) < 200, 0.0, 1.0) - 0.01 * np.arange(400)
     jump = Recording(record(400, Ts).u, y[:, None], Ts, channels=("theta",), accept=("short",))
     speed, error, unit = localise._speed(jump, "theta", 0.0, None)

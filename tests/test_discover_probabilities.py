@@ -1,4 +1,4 @@
-"""Probabilities of sets of effects: known evidence, scatter, credible sets, what is told of them."""
+"""Probabilities of sets of effects: given evidence, scatter, credible sets, sentences, calibration."""
 
 import dataclasses
 import json
@@ -49,13 +49,13 @@ PLAIN = EvidenceRule(temperature=1.0, prior_nats=0.0, passed_nats=0.0)
 
 
 def fitted(names: str, lead=0.0, runs=0.0, free_run=True) -> FittedSet:
-    """A set that leads by so many nats in all, evenly."""
+    """A set whose evidence leads by `lead` and `runs` in sum, evenly over the half seconds."""
     free = 0.01 * COMMON + runs / BLOCKS if free_run else None
     return FittedSet(frozenset(names.split()), COMMON + lead / BLOCKS, free)
 
 
 def test_even_leads_are_a_softmax():
-    """Without scatter no weighting of the half seconds changes a sum."""
+    """If leads are the same in every half second, probabilities are a softmax of the sums: a closed form."""
     lead, runs, n = np.array([4.0, 0.0, 6.5, 4.5]), np.array([0.3, 0.0, 0.5, -0.2]), np.array([1, 0, 2, 1])
     sets = [
         fitted(s, x, f) for s, x, f in zip(("a@hub", "", "a@hub b@arm", "b@arm"), lead, runs, strict=True)
@@ -64,7 +64,7 @@ def test_even_leads_are_a_softmax():
     expected = softmax(lead / 2.0 + 1.5 * runs - 0.7 * n + passed)
     np.testing.assert_allclose(set_probabilities(sets, rule=RULE), expected, rtol=1e-9)
     assert expected.min() > 0.02  # none is negligible
-    # Where something remains, nats of predictions count for less; in the end, for nothing.
+    # With a larger misfit, nats of predictions count less; with an infinite misfit, they do not count.
     expected = softmax(lead / 20.0 + 1.5 * runs - 0.7 * n + passed)
     np.testing.assert_allclose(set_probabilities(sets, misfit=10.0, rule=RULE), expected, rtol=1e-9)
     expected = softmax(1.5 * runs - 0.7 * n + passed)
@@ -72,25 +72,26 @@ def test_even_leads_are_a_softmax():
 
 
 def test_a_missing_horizon_says_as_much_as_the_reference():
+    """A set that was not fitted at a horizon gets the evidence of the reference set there."""
     at_one, as_reference = fitted("b@arm", 5.0, free_run=False), fitted("b@arm", 5.0, 0.8)
     first = fitted("a@hub", 5.0, 0.8)
     p, q = (set_probabilities([first, other], rule=RULE) for other in (at_one, as_reference))
     np.testing.assert_allclose(p, q)
     np.testing.assert_allclose(p, softmax([0.4, 0.0]))
-    # The reference is the first that has both, wherever it stands.
+    # The reference is the first set that was fitted at both horizons, whatever its position.
     np.testing.assert_allclose(set_probabilities([at_one, first], rule=RULE), softmax([0.4, 0.0]))
     runs_alone = FittedSet(frozenset({"c@hub"}), None, first.free_run)
     np.testing.assert_allclose(set_probabilities([first, runs_alone], rule=RULE), softmax([0.4, 0.0]))
 
 
 def test_the_reference_was_fitted_at_both_horizons():
-    """One that was fitted to predictions alone stands first; free runs of the others still count."""
+    """If the first set was fitted to predictions alone, free runs of the others still count."""
     sets = [fitted("b@arm", 5.0, free_run=False), fitted("a@hub", 5.0, 0.8), fitted("c@hub", 5.0, 0.0)]
     np.testing.assert_allclose(set_probabilities(sets, rule=RULE), softmax([0.4, 0.0, -1.5 * 0.8]))
 
 
 def test_a_lead_within_its_scatter_does_not_decide():
-    """A sharp likelihood whose half seconds scatter: the probability is that of the sign of the lead."""
+    """A lead of z standard deviations over the half seconds has the probability Phi(z) of a normal law."""
     many, rng = 400, np.random.default_rng(3)
     noise = rng.normal(size=many) * 30
     noise -= noise.mean()
@@ -102,7 +103,7 @@ def test_a_lead_within_its_scatter_does_not_decide():
 
     for z in (0.0, 1.0, 2.0):
         assert of_lead(noise + z * spread / many) == pytest.approx(norm.cdf(z), abs=0.025)
-    # The same lead without scatter is certain.
+    # The same lead without scatter has a probability near one.
     assert of_lead(np.full(many, 2.0 * spread / many)) > 1 - 1e-9
 
 
@@ -124,7 +125,7 @@ def found():
 
 
 def test_sets_effects_and_what_lies_elsewhere(found):
-    """Weights 1, 1/2, 1/4; the second fit of a set is left out."""
+    """The evidence gives the weights 1, 1/2 and 1/4; the second fit of a set is left out."""
     p = 0.96 * np.array([4, 2, 1]) / 7
     assert [s.effects for s in found.sets] == [
         {"coulomb@hub"},
@@ -139,7 +140,7 @@ def test_sets_effects_and_what_lies_elsewhere(found):
 
 
 def test_credible_sets_are_the_smallest(found):
-    """4, 2 and 1 of seven parts of what was fitted."""
+    """The fitted sets have the shares 4/7, 2/7 and 1/7."""
     assert found.credible(0.5) == found.credible(4 / 7) == found.sets[:1]
     assert found.credible(0.58) == found.credible(6 / 7) == found.sets[:2]
     assert found.credible(0.9) == found.credible(1) == found.sets
@@ -175,7 +176,7 @@ def test_a_sentence_names_three_sets_at_most_and_none_below_a_hundredth():
     )
     assert told(0.970, 0.0099).endswith("Coulomb friction at hub 97 %; none of these 2 %.")
     assert "delay" in told(0.5, 0.2, 0.15, 0.13) and "cogging" not in told(0.5, 0.2, 0.15, 0.13)
-    # Of many that are all unlikely the first is named.
+    # If all sets are unlikely, the first one is named.
     assert "Coulomb friction at hub < 1 %; none" in told(0.009, 0.008)
 
 
@@ -188,7 +189,7 @@ def fit_of(*names: str, train=0.0, held_out=0.0, free_run=None):
 
 
 def test_of_fits_that_are_as_likely_in_training_the_better_on_validation_data_counts():
-    """To one nat; a fit that missed the minimum does not count, however well it does there."""
+    """Fits within one nat in training are equal; a worse one is left out, however well it validates."""
     first, as_likely, missed = (
         fit_of(train=10.0),
         fit_of(train=9.1, held_out=3.0),
@@ -209,7 +210,7 @@ def test_a_set_has_what_its_fits_say_at_each_horizon(at):
     runs = fit_of("coulomb", train=5.0)
     both = fit_of("coulomb", "sensor_bias", train=1.0, free_run=runs)
     alone = fit_of("lag", train=2.0)
-    # Predictions ruled it out, so that it was not fitted to free runs: these blocks are never of free runs.
+    # Excluded by predictions and so not fitted to free runs: its blocks must not count as free runs.
     ruled_out = fit_of("dead_zone", train=3.0)
     first, third, second = fitted_sets(horizons, [both, ruled_out], [alone], getattr(horizons, at), [offset])
     assert third.prediction is ruled_out.blocks and third.free_run is None
@@ -221,7 +222,7 @@ def test_a_set_has_what_its_fits_say_at_each_horizon(at):
 
 
 def test_calibration_error_by_hand():
-    """Ten of 0.85 of which seven are so, five of 0.25 of which one is; what is below 0.01 does not count."""
+    """Seven of ten events of 0.85 are true, one of five of 0.25; events below 0.01 are left out."""
     events = [Event(0.85, k < 7) for k in range(10)] + [Event(0.25, k < 1) for k in range(5)]
     events += [Event(0.001, False)] * 100
     assert calibration_error(events) == pytest.approx((10 * 0.15 + 5 * 0.05) / 15)
@@ -235,7 +236,7 @@ def row(sets, wanted=(), **more):
 
 
 def test_sets_that_are_one_answer_count_once():
-    """An asymmetric friction is a symmetric one and an offset; what is wrong besides is neutral."""
+    """Asymmetric friction equals symmetric friction with an offset; faults besides the effect are neutral."""
     sets = [
         [["coulomb@hub", "voltage_offset@input"], 0.5],
         [["coulomb_asymmetric@hub"], 0.3],
@@ -261,7 +262,7 @@ def test_a_row_is_weighed_again_as_it_was(found):
 
 
 def test_an_older_row_has_the_misfit_of_its_errors():
-    """Twice the error that a verdict allows of one channel: a variance four times as large."""
+    """One channel has twice the error that a verdict allows, so the misfit is 4."""
     old = {"noise_floor": {"theta": 1e-3, "alpha": 2e-3}, "windows": {"theta": 3e-3, "alpha": 1e-3}}
     assert misfit(old) == pytest.approx(4.0)
     assert misfit({**old, "windows": {"theta": 1.4e-3, "alpha": 1e-3}}) == 1.0
@@ -269,22 +270,22 @@ def test_an_older_row_has_the_misfit_of_its_errors():
 
 
 def test_few_machines_scatter_as_much_as_their_probabilities_say():
-    """One bin of `n` sets of 0.75: the calibration error is that of a mean of `n` Bernoulli trials."""
+    """The calibration error of 20 answers of 0.75 is that of the mean of 20 Bernoulli trials."""
     mean, high = scatter_of_right([[0.75]] * 20)
     drawn = np.abs(np.random.default_rng(1).binomial(20, 0.75, 20_000) / 20 - 0.75)
     assert mean == pytest.approx(drawn.mean(), rel=0.15)
     assert high == pytest.approx(np.quantile(drawn, 0.95), rel=0.3)
-    # Answers exclude each other: of two of one half each, one is right.
+    # Answers exclude each other: of two of 0.5 each, exactly one is right.
     assert scatter_of_right([[0.5, 0.5]] * 20)[1] == 0.0
 
 
 def test_the_rule_is_the_one_that_was_calibrated() -> None:
-    """What `benchmarks/set_probabilities.py` found on tuning seeds."""
+    """The constants are those that `benchmarks/set_probabilities.py` found on tuning seeds."""
     assert EvidenceRule(5.0, 0.2, 2.0, 3.0, 0.02, 0.17) == CALIBRATED
     sets = [FittedSet(frozenset(), np.zeros(4), np.zeros(4))]
     for misfit_of, elsewhere in ((1.0, 0.02), (math.inf, 0.17)):
         found = probabilities(sets, misfit=misfit_of)
         assert found.elsewhere == pytest.approx(elsewhere)
         assert found.sets[0].probability == pytest.approx(1 - elsewhere)
-        # What they were computed from is neither shown nor compared.
+        # The evidence is neither printed nor compared.
         assert "FittedSet" not in repr(found) and found == dataclasses.replace(found, evidence=())

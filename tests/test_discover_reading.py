@@ -1,4 +1,4 @@
-"""A smooth input is noticed, and so are a channel with the opposite sign and validation data at rest."""
+"""A search detects a smooth input, a channel with the opposite sign, and validation data at rest."""
 
 import dataclasses
 import re
@@ -24,9 +24,9 @@ def multisine(t: np.ndarray) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def smooth() -> tuple[rf.Recording, rf.Recording]:
-    """100 samples a second of a voltage that goes on between them; from an independent simulator."""
+    """Recordings at 100 Hz of a voltage that varies between the samples, by an independent simulator."""
     t = np.arange(round(SECONDS * FAST)) / FAST
-    played = multisine(t + 0.5 / FAST)  # held there for a tenth of a sample, which delays by half of that
+    played = multisine(t + 0.5 / FAST)  # held for 1 ms there: a delay of 0.5 ms
     r = make_record({("coulomb", "hub"): {"level": 0.03}}, seed=5, fs=FAST, played=played)
     step = FAST // SLOW
     return rf.Recording(u=multisine(t)[::step], y=r["y"][::step], Ts=1 / SLOW).split(0.7)
@@ -34,7 +34,7 @@ def smooth() -> tuple[rf.Recording, rf.Recording]:
 
 def test_the_middle_of_each_sample_is_held() -> None:
     k, w = np.arange(400.0), 0.9
-    # Steps of a sine have its frequency with the amplitude sin(w / 2) / (w / 2), half a sample late.
+    # A sampled and held sine has an amplitude of sin(w / 2) / (w / 2) and is half a sample late.
     found, wanted = held_equivalent(np.sin(w * k)), np.sin(w * (k + 0.5)) / np.sinc(w / (2 * np.pi))
     np.testing.assert_allclose(found[40:-40], wanted[40:-40], atol=1e-3)
 
@@ -60,7 +60,7 @@ def test_a_held_input_is_not_offered_another_reading() -> None:
 
 
 def signs(train: rf.Recording, validation: rf.Recording, model: rf.Mechanism) -> tuple[list[str], list[str]]:
-    """What is said of signs in the notes of a search, and while it runs."""
+    """Messages about signs in the notes of a search, and in its lines of progress."""
     said: list[str] = []
     found = rf.discover(model, train, validation, candidates=FRICTIONS, rounds=0, progress=said.append)
     notes, lines = ([x for x in texts if "opposite sign" in x] for texts in (found.notes, said))
@@ -72,7 +72,7 @@ def negated(r: rf.Recording) -> rf.Recording:
 
 
 def test_a_channel_with_the_opposite_sign_is_named() -> None:
-    """From a stiffness that is far from the machine's, 1.6 N m/rad; the right sign is left alone."""
+    """The fit starts far from the true stiffness of 1.6 N m/rad; the right sign gives no message."""
     r = make_record({("coulomb", "hub"): {"level": 0.03}}, kind="steps", seed=3, seconds=8.0, fs=250.0)
     runs = rf.Recording(u=r["u"], y=r["y"], Ts=1 / 250).split(0.7)
     joint = rf.joints.paper().with_values({"joint.spring.stiffness": 0.4})
@@ -104,7 +104,7 @@ def test_all_channels_with_the_opposite_sign_are_an_input_with_it() -> None:
 
 
 def test_validation_data_at_rest_are_named() -> None:
-    """A voltage that stops before the last part: the hub rests there, held by its friction."""
+    """The voltage is zero in the validation part, in which friction holds the hub at rest."""
     t = np.arange(round(10 * FAST)) / FAST
     played = np.where(t < 6.0, 2 * multisine(t), 0.0)
     r = make_record({("coulomb", "hub"): {"level": 0.03}}, seed=5, fs=FAST, played=played)

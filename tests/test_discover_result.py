@@ -1,4 +1,4 @@
-"""Intervals of predictions and of free runs that exclude each other: said, as the model is incomplete."""
+"""A note says that the model is incomplete if intervals of predictions and free runs are disjoint."""
 
 import dataclasses
 import json
@@ -49,7 +49,7 @@ def test_a_result_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     true = summary.estimates
 
     def shifted(problem: LikelihoodProblem, h: object) -> tuple[Estimate, ...]:
-        """As if free runs had their own best inertia."""
+        """Estimates, with the inertia of free runs shifted by ten standard deviations."""
         return tuple(
             inertia(e.value + 10 * e.std, e.std) if problem.free_run and e.name.endswith("inertia") else e
             for e in true(problem, h)

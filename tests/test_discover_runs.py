@@ -1,4 +1,4 @@
-"""An offset belongs to a run until another run shows the same."""
+"""An offset belongs to one run, unless another run has the same offset."""
 
 import dataclasses
 
@@ -14,14 +14,14 @@ from rotflex_jax.recording.recording import digest_of_recordings, joined, of_one
 
 @pytest.fixture(scope="module")
 def parts():
-    """A run with an offset in three parts, and one of the same machine without."""
+    """Three parts of one run with an offset, and another run of the same machine without it."""
     first, rest = run(0.06, 0.04, 0, N=4500).split(1 / 3)
     return first, *rest.split(0.5), run(0.06, 0.0, 1)
 
 
 @pytest.fixture(scope="module")
 def found(parts):
-    """Learnt from one run, and evaluated on its end and on another one."""
+    """A search on two parts of one run, tested on its third part and on another run."""
     arm = rf.joints.rotary_arm(flexible=False) + Coulomb("hub", level=0.03)
     return rf.discover(arm, parts[0], parts[1], test=parts[2:], candidates=[], rounds=0)
 
@@ -30,7 +30,7 @@ def test_parts_know_their_run(parts):
     first, second, third, other = parts
     assert of_one_run(first, second) and of_one_run(third, second) and of_one_run(other, other)
     assert not of_one_run(first, other) and not of_one_run(other, third)
-    # A common beginning at rest makes no common run.
+    # Two runs that both begin at rest are not one run.
     N, moving = 200, np.random.default_rng(0).normal(size=(2, 200))
     a, b = (
         rf.Recording(np.r_[np.zeros(N), u], np.r_[np.zeros(N), u][:, None], 0.002, channels=("theta",))
@@ -47,13 +47,13 @@ def test_parts_that_follow_on_each_other_are_one_recording(parts):
     np.testing.assert_array_equal(whole.u, np.concatenate([first.u, second.u]))
     assert [r.N for r in joined([second, third])] == [second.N + third.N]
     assert joined([second, third])[0].continues is second.continues
-    # In whatever order they are given, and where a part knows only the one before it.
+    # The order does not matter, and a part may refer to the part before it alone.
     for order in ([second, first], [first, third, second], [third, second, first]):
         (run,) = joined(order)
         assert run.start == first.start and sum(r.N for r in order) == run.N
     after = dataclasses.replace(third, continues=second)
     assert [r.N for r in joined([first, second, after])] == [first.N + second.N + third.N]
-    # Not across a gap, and not what is of another machine or measured otherwise.
+    # Not across a gap, and not if constants, channels, units or sampling periods differ.
     changes = {"constants": {"J": 1.0}, "channels": ("phi",), "units": ("deg",), "Ts": 2 * second.Ts}
     others = [
         dataclasses.replace(second, **{name: value}, resolution=None) for name, value in changes.items()
@@ -64,7 +64,7 @@ def test_parts_that_follow_on_each_other_are_one_recording(parts):
 
 
 def test_parts_of_one_run_share_its_offset_in_the_last_fit(parts):
-    """Half of the friction is missing and may not be fitted, so the search ends unexplained."""
+    """Friction is trusted at half of its true level, so the search ends unexplained and has a final fit."""
     arm = (rf.joints.rotary_arm(flexible=False) + Coulomb("hub", level=0.03)).trust("hub.coulomb.level")
     first, second, third, other = parts
     found = rf.discover(arm, first, second, test=[third, other], candidates=[], rounds=0)
@@ -72,7 +72,7 @@ def test_parts_of_one_run_share_its_offset_in_the_last_fit(parts):
     assert last is not None and [r.N for r in last.recordings] == [first.N + second.N]
     assert [len(each) for each in last.fit.local.values()] == [1] * len(last.fit.local) != []
     assert last.fit.data == digest_of_recordings(last.recordings)
-    # Every part of the run knows the offset, no other run does.
+    # Models of all parts of this run have the offset, the model of the other run has none.
     assert [OFFSET in found.model_of(r).mechanism.parameter_names for r in parts] == [True] * 3 + [False]
 
 
@@ -88,7 +88,7 @@ def test_of_parts_of_one_run_the_one_that_has_a_recording_knows_its_offset(parts
     first, second, third, other = parts
     known = KnownRuns.of([first, third], [second])
     assert [known.index(r) for r in (first, third, third.slice(200, 900), other)] == [0, 1, 1, None]
-    # Where none has it, the one that is nearest.
+    # A part of no recording gets the offset of the nearest one.
     assert [known.index(second.slice(a, a + 600)) for a in (100, second.N - 700)] == [0, 1]
 
 
@@ -100,7 +100,7 @@ def test_another_run_starts_without_the_offset_of_one(found, parts):
     assert OFFSET in found.model_of(third).mechanism.parameter_names
     bare = found.model_of(other)
     assert OFFSET not in bare.mechanism.parameter_names
-    # Reported are the errors of just these models.
+    # The reported errors are those of these models.
     missed = [short_runs_miss(found.model_of(r), r) for r in (third, other)]
     lengths = [r.N for r in (third, other)]
     together = np.sqrt(np.average(np.square(missed), weights=lengths))

@@ -1,4 +1,4 @@
-"""Scores foretell what refits find; the super-model is the baseline until something is switched on."""
+"""Scores predict the gains of refits; the super-model with all gates off equals the baseline."""
 
 import dataclasses
 
@@ -22,14 +22,14 @@ SMALL = 0.0015
 
 @pytest.fixture(scope="module")
 def weak():
-    """Recordings with a little friction: likelihood, baseline at its optimum, its scores by place."""
+    """Recordings with little friction: likelihood, fitted baseline, and its scores by location."""
     problem = sp.problem(sp.recordings(sp.records(SMALL)))
     h = sp.fitted(problem)
     return problem, h, {s.location: s for s in score_test(problem, h).listed}
 
 
 def switched_on(problem, h: Hypothesis, score: Score) -> Hypothesis:
-    """The baseline with a candidate, where its score says."""
+    """The baseline with a candidate, at the values that its score test estimates."""
     s = problem.supermodel
     c = s.candidates[score.location]
     specs = [s.mechanism.parameter_specifications[i] for i in c.parameters]
@@ -41,7 +41,7 @@ def switched_on(problem, h: Hypothesis, score: Score) -> Hypothesis:
 
 
 def gain(problem, score: Score) -> float:
-    """Nats to first order, without the price of the number."""
+    """First-order gain [nat], without the penalty for the one parameter."""
     return score.nats + 0.5 * np.log(np.sum(problem.seen) * 2)
 
 
@@ -64,13 +64,13 @@ def test_the_true_effect_comes_first(weak):
     assert [s.location for s in listed] == [s.location for s in sorted(listed, key=lambda s: -s.nats)]
     assert listed[0].location == sp.HUB and listed[0].nats > 0
     assert found[sp.HUB].excited and 0.001 < found[sp.HUB].orthogonal_fraction < 1
-    # The visible size is a share of the size tried, a tenth of the motor's torque.
+    # The detection limit is a share of the size of the probe, a tenth of the motor's torque.
     tried = 0.1 * problem.dataset.torque_scale
     assert found[sp.HUB].detection_limit * tried < SMALL
 
 
 def test_what_the_baseline_can_move_has_no_score(weak):
-    """Viscous friction at the hub is back-EMF by another name, and the back-EMF is free."""
+    """Viscous friction at the hub has the effect of back-EMF, which is free in the baseline."""
     problem, _, found = weak
     score = found[("viscous", "hub")]
     assert score.orthogonal_fraction < 1e-3
@@ -92,7 +92,7 @@ def test_what_is_in_the_hypothesis_is_scored_no_more(weak):
 
 
 def test_switched_off_it_is_the_baseline(weak):
-    """Innovations of a free run are those of the baseline alone, to the last digits."""
+    """Innovations of a free run equal those of the baseline alone to 1e-11."""
     problem, _, _ = weak
     s = problem.supermodel
     off = sp.start(problem, locations=())
@@ -107,7 +107,7 @@ def test_switched_off_it_is_the_baseline(weak):
 
 @pytest.mark.parametrize("friction", [False, True])
 def test_switched_on_it_is_the_clean_model(weak, friction):
-    """To the last digits."""
+    """Innovations equal those of a model with the same effects to 1e-9."""
     exact = 1e-9
     problem, h, _ = weak
     s = problem.supermodel

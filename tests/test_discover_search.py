@@ -1,4 +1,4 @@
-"""What a search refuses before it works, rare cases, and how many programs it compiles."""
+"""Input that a search refuses, rare cases, and the number of programs that a search compiles."""
 
 import dataclasses
 import math
@@ -21,12 +21,12 @@ NAN = float("nan")
 
 
 def again(recording: rf.Recording) -> rf.Recording:
-    """The same numbers, read once more."""
+    """A copy of a recording, as if it were read again from another file."""
     return dataclasses.replace(recording, u=recording.u.copy(), y=recording.y.copy(), source="again.csv")
 
 
 def test_pieces_of_one_recording_are_told_by_their_samples() -> None:
-    """However they were cut; standstill, the same input and a few samples at an end prove nothing."""
+    """Any cut is recognised; standstill, equal inputs alone and a short overlap do not count."""
     whole, N = spun(), 1500
     piece = whole.slice
     alike = [
@@ -46,7 +46,7 @@ def test_pieces_of_one_recording_are_told_by_their_samples() -> None:
 
 
 def test_parts_of_a_signal_that_repeats_itself_are_apart() -> None:
-    """Two seconds of motion over and over, without noise: the parts know which of them comes first."""
+    """The same motion twice, without noise: parts of one recording are known to follow each other."""
     whole = spun()
     n = whole.N // 2
     again = dataclasses.replace(whole, u=np.tile(whole.u[:n], 2), y=np.tile(whole.y[:n], (2, 1)))
@@ -82,7 +82,7 @@ def test_a_constant_of_what_a_search_may_add_is_refused() -> None:
     a, b = (dataclasses.replace(r, constants={"shaft.coulomb.level": 0.03}) for r in spun().split(0.7))
     with pytest.raises(InputError, match=r"'shaft\.coulomb\.level', but the model has no such effect"):
         rf.discover(SPINDLE, a, b, candidates=PAIRS)
-    # One of another machine says nothing here.
+    # A constant of another machine is ignored.
     other = [dataclasses.replace(r, constants={"belt.spring.stiffness": 3.0}) for r in (a, b)]
     assert rf.discover(SPINDLE, *other, candidates=PAIRS, rounds=0).rounds == ()
 
@@ -92,7 +92,7 @@ def test_without_known_noise_the_criterion_says_so() -> None:
     assert not known.is_explained
     assert known.criterion == "the sensor noise of alpha is not known, to compare what is left with"
     assert "theta and alpha" in Assessment({}, {"theta": NAN, "alpha": NAN}, 0.0).criterion
-    # A channel that is above its noise decides, wherever it stands.
+    # A channel that is above its noise decides, whatever its position.
     for remaining in ({"theta": NAN, "alpha": 2.0}, {"alpha": 2.0, "theta": NAN}):
         assert Assessment({}, remaining, 0.0).criterion.startswith("the error of alpha in short")
     assert in_noise({"theta": 1.2, "alpha": NAN}) == "theta 1.20, alpha an unknown number of"
@@ -100,9 +100,9 @@ def test_without_known_noise_the_criterion_says_so() -> None:
 
 @pytest.mark.parametrize("torque_constant", [0.4, 1.6])
 def test_the_error_of_a_coarse_integration_is_no_missing_physics(torque_constant: float) -> None:
-    """Sliding that stops within a sample of 5 ms, whatever the motor's constant that the user starts from.
+    """Sliding that stops within a sample of 5 ms leaves no unexplained torque, from either start of the fit.
 
-    With the step of the search, the predictor asks for random torques worth 0.1 nat per value.
+    With the step of integration of the search, process noise gains 0.1 nat per value.
     """
     made = make_record([("coulomb", "hub")], kind="noise", seed=3, seconds=12.0, fs=200.0)
     train, validation = rf.Recording(u=made["u"], y=made["y"], Ts=made["Ts"]).split(0.7)
@@ -118,7 +118,7 @@ def test_the_error_of_a_coarse_integration_is_no_missing_physics(torque_constant
 
 
 def test_a_calibration_has_its_gain_at_either_horizon(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The voltage is 0.3 V off in the machine; where free runs give the parameters, its gain is no null."""
+    """The gain of a voltage offset of 0.3 V is finite and positive also if free runs give the parameters."""
     run = spun()
     parts = dataclasses.replace(run, u=run.u - 0.3).split(0.7)
     model = SPINDLE + rf.effects.Coulomb(at="shaft")
@@ -137,9 +137,9 @@ def test_a_calibration_has_its_gain_at_either_horizon(monkeypatch: pytest.Monkey
 
 
 CANDIDATES = [(fx.Coulomb, "hub"), (fx.CubicSpring, "joint")]
-# A structure that is fitted has a run and its slopes, one that is scored its run and how that responds to one
-# contact more; each sort of laws has a program for all structures of one size. Models that are reported share
-# four for their free runs, and the final one has one for runs with finer steps; the linear part has one.
+# Programs of a structure that is fitted: its run and its derivatives; of one that is scored: its run and the
+# response to one more contact. Each kind of law has one program for all structures of one size. Reported
+# models share four for free runs, the final model has one for runs with finer steps, the linear part has one.
 FITTED, SCORED, LAWS, SHARED = 2, 2, 2, 6
 
 
@@ -151,7 +151,7 @@ def searched(seed: int, samples: int = 1500) -> Discovery:
 
 
 def made_by(search: Callable[[], Discovery]) -> tuple[int, Discovery]:
-    """How many programs a search made, compiled or loaded, and its result."""
+    """Number of programs that a search compiled or loaded, and its result."""
     before = program_counts()
     found = search()
     after = program_counts()
@@ -162,7 +162,7 @@ def test_a_search_makes_few_programs_and_each_once() -> None:
     release_programs()
     first, found = made_by(lambda: searched(2010))
     assert [(r.effect, r.port) for r in found.rounds] == [("coulomb", "hub")]
-    # Fitted and scored: the baseline, and with the effect that is hidden.
+    # Two structures are fitted and scored: the baseline with and without the hidden effect.
     assert 0 < first <= 2 * (FITTED + SCORED) + LAWS + SHARED
     again, same = made_by(lambda: searched(2010))
     assert again == 0
@@ -170,7 +170,7 @@ def test_a_search_makes_few_programs_and_each_once() -> None:
 
 
 def test_another_length_makes_no_more() -> None:
-    """Of the same recording a part, which has another number of samples and fewer windows."""
+    """A part of the same recording, with fewer samples and windows, needs no further program."""
     searched(2010)
     others, found = made_by(lambda: searched(2010, samples=1310))
     assert [(r.effect, r.port) for r in found.rounds] == [("coulomb", "hub")]
@@ -178,7 +178,7 @@ def test_another_length_makes_no_more() -> None:
 
 
 def test_other_numbers_make_no_more() -> None:
-    """Another recording of the same length, on which the same structures are tried."""
+    """Another recording of the same length needs no further program, or those of one more fit."""
     searched(2010)
     others, found = made_by(lambda: searched(2011))
     assert [(r.effect, r.port) for r in found.rounds] == [("coulomb", "hub")]
@@ -188,7 +188,7 @@ def test_other_numbers_make_no_more() -> None:
 def test_dry_friction_is_tried_where_other_candidates_have_crowded_it_out(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A round that tries none and adds nothing is followed by one of dry friction at the motor."""
+    """If the first round tries no dry friction and adds nothing, dry friction at the motor is tried."""
     ranked = forward_selection.promising_at_both
 
     def crowded(*given):
@@ -202,7 +202,7 @@ def test_dry_friction_is_tried_where_other_candidates_have_crowded_it_out(
     tried = [line for line in said if line.startswith("refitting ")]
     assert any("coulomb at shaft" in line for line in tried[1:]), said
     assert [(r.effect, r.port) for r in found.rounds] == [("coulomb", "shaft")]
-    # Not where the model has a law of it already, and not where nothing is left.
+    # It is not tried if the model has a law of it already and nothing is left to explain.
     said.clear()
     rf.discover(SPINDLE + fx.Coulomb("shaft"), *parts, candidates=candidates, rounds=1, progress=said.append)
     assert not any("lugre at shaft" in line for line in said if line.startswith("refitting "))

@@ -1,4 +1,4 @@
-"""Which candidate wins, which are not distinguished and which are refused; each limit from both sides."""
+"""Which candidate is chosen, not distinguished or refused; each limit is tested from both sides."""
 
 import dataclasses
 from collections.abc import Callable
@@ -31,7 +31,7 @@ from rotflex_jax.discover.validation import ValidatedHypothesis, ValidationSet, 
 from rotflex_jax.fit.dataset import StackedRecordings
 from rotflex_jax.recording import Recording
 
-# 60 s at 50 Hz: 120 blocks of 25 samples, on either side.
+# 60 s at 50 Hz: 120 blocks of 25 samples, in training and in validation data.
 N, BLOCKS = 3000, 120
 MEASURED = 2.0 * N  # values of two channels
 NOISE = np.array([1e-3, 1e-3])
@@ -41,16 +41,16 @@ COMMON = np.random.default_rng(0).normal(size=BLOCKS) * 50
 def trial(
     location, held_out=0.0, train=0.0, windows=2.0, scatter=0.0, seed=1, numbers=1
 ) -> ValidatedHypothesis:
-    """A trial whose blocks lead those of the base by so many nats in all.
+    """A validated hypothesis whose blocks lead those of the base by given sums.
 
     Args:
-        location: What it adds.
-        held_out: Lead over the base on held-out data [nat].
-        train: The same on training data [nat].
+        location: Effect that it adds.
+        held_out: Lead over the base on validation data [nat].
+        train: Lead over the base on training data [nat].
         windows: Error of short free runs, in units of the noise.
-        scatter: Deviation of the lead of a block [nat], a multiple of an odd pattern without mean.
-        seed: Of the pattern.
-        numbers: That it takes.
+        scatter: Standard deviation of the lead of a block [nat], a multiple of a random pattern of mean zero.
+        seed: Seed of the pattern.
+        numbers: Number of parameters of the effect.
     """
     pattern = np.random.default_rng(seed).normal(size=BLOCKS)
     pattern = scatter * (pattern - pattern.mean()) / pattern.std()
@@ -69,14 +69,14 @@ ARM, HARDENING = EffectLocation("coulomb", "arm"), EffectLocation("cubic_spring"
 
 
 def test_a_lead_is_paired():
-    """What scatters in both alike does not count."""
+    """Scatter that is common to both does not count."""
     d = np.array([1.0, 2.0, 3.0, 2.0])
     common = 1000 * np.random.default_rng(3).normal(size=4)
     nats, z = paired_gain(common + d, common)
     assert nats == pytest.approx(8.0)
     assert z == pytest.approx(8.0 / (np.std(d, ddof=1) * 2))
     assert paired_gain(common, common + d)[1] == pytest.approx(-z)
-    assert paired_gain(np.array([5.0]), np.array([1.0])) == (4.0, 0.0)  # one block cannot tell a scatter
+    assert paired_gain(np.array([5.0]), np.array([1.0])) == (4.0, 0.0)  # one block has no scatter
 
 
 def test_a_lead_of_z_two_is_rare_where_there_is_none():
@@ -86,7 +86,7 @@ def test_a_lead_of_z_two_is_rare_where_there_is_none():
 
 
 def test_blocks_of_half_a_second():
-    """The rest joins its neighbour; unseen samples and other recordings stay out."""
+    """A remainder joins the last block; blocks leave out unseen samples and do not cross recordings."""
     seen = np.zeros((2, 130))
     seen[0, :130], seen[1, :99] = 1, 1
     data = StackedRecordings(seen, np.zeros((2, 130, 2)), seen, np.array([0.01, 0.02]))
@@ -101,7 +101,7 @@ GOOD = {"held_out": 200.0, "train": 200.0, "windows": 5.0, "scatter": 0.5}
 
 
 def at_both(prediction: dict, free_run: dict, location=None) -> ValidatedHypothesis:
-    """A hypothesis with leads at both horizons; those of free runs are logarithms of errors."""
+    """A hypothesis with leads at both horizons; leads of free runs are logarithms of error ratios."""
     return dataclasses.replace(trial(location, **prediction), free_run=trial(location, **free_run))
 
 
@@ -110,13 +110,13 @@ STRONG = {"held_out": 40.0, "train": 40.0, "windows": 5.0, "scatter": 0.3}
 
 
 def test_free_runs_alone_may_ask_for_an_effect():
-    """Predictions that follow the data within a few samples see nothing of what acts slowly."""
+    """A predictor that follows the data within a few samples is insensitive to slow effects."""
     assert admissible(at_both(NOTHING, STRONG, COULOMB), FAR, MEASURED, NOISE)
     assert not admissible(at_both(NOTHING, NOTHING, COULOMB), FAR, MEASURED, NOISE)
-    # They must be sure, on both sets, and the error must fall by more than a little.
+    # The gain must be certain on training and validation data, and the error must fall by a tenth.
     for spoilt in ({"scatter": 4.0}, {"train": 0.0}, {"windows": 9.5}):
         assert not admissible(at_both(NOTHING, STRONG | spoilt, COULOMB), FAR, MEASURED, NOISE), spoilt
-    # Near the sensor noise predictions have the power, and free runs alone do not count.
+    # Near the sensor noise predictions have more power, and free runs alone do not count.
     near = at_both({"windows": 1.1}, {"windows": 1.1})
     assert not admissible(
         at_both({"windows": 1.1}, STRONG | {"windows": 0.9}, COULOMB), near, MEASURED, NOISE
@@ -134,21 +134,21 @@ def test_free_runs_alone_may_ask_for_an_effect():
     ],
 )
 def test_free_runs_that_training_data_see_the_other_way_round_distinguish_nothing(spoilt: dict, apart: bool):
-    """An error that is a fifth larger over validation data, unless blocks of either set prefer it."""
+    """A rival with a larger validation error is excluded, unless blocks of either data set prefer it."""
     winner = at_both(NOTHING, STRONG, COULOMB)
     rival = at_both(NOTHING, STRONG | {"held_out": 39.0, "train": 39.0, "windows": 6.0} | spoilt, DRAG)
     assert selection.free_runs_apart(winner, rival) == apart
 
 
 def test_parameters_of_predictions_need_not_suit_free_runs():
-    """A candidate whose predictions gain is not refused for the free runs of its predictor's parameters."""
+    """Free runs with the parameters of predictions may be worse, if those fitted to free runs are better."""
     worse = GOOD | {"windows": 12.0}
     assert not admissible(at_both(worse, NOTHING, COULOMB), FAR, MEASURED, NOISE)
     assert admissible(at_both(worse, STRONG, COULOMB), FAR, MEASURED, NOISE)
 
 
 def test_what_both_horizons_want_wins():
-    """One leads as a predictor, another one in free runs, a third is near the top of both."""
+    """A candidate that is near the best at both horizons wins over the best at one horizon."""
     predicts = at_both(GOOD | {"held_out": 400.0}, STRONG | {"held_out": 10.0}, ARM)
     both = at_both(GOOD | {"held_out": 300.0}, STRONG | {"held_out": 38.0}, COULOMB)
     runs = at_both(GOOD | {"held_out": 20.0}, STRONG, DRAG)
@@ -193,7 +193,7 @@ def test_near_the_noise_free_runs_need_not_get_better():
 
 def test_the_likeliest_on_held_out_data_wins():
     best = trial(DRAG, **GOOD | {"held_out": 400.0, "train": 300.0})
-    # More on the training data is not what counts.
+    # A larger gain on training data does not count.
     other = trial(EffectLocation("quadratic_drag", "arm"), **GOOD | {"train": 900.0}, seed=2)
     assert choose([other, best], BASE, MEASURED, NOISE)[0] is best
     assert choose([trial(ARM, held_out=-1.0)], BASE, MEASURED, NOISE) == (None, [])
@@ -201,7 +201,7 @@ def test_the_likeliest_on_held_out_data_wins():
 
 
 def test_what_cannot_be_told_apart_is_named_together():
-    """The difference of the two is smaller than its scatter over the blocks."""
+    """Two candidates are reported together if their difference is within its scatter over the blocks."""
     best = trial(DRAG, **GOOD | {"held_out": 210.0, "train": 210.0}, seed=1)
     close = trial(HARDENING, **GOOD | {"held_out": 200.0, "train": 200.0, "scatter": 3.0}, seed=2)
     assert paired_gain(best.blocks, close.blocks)[0] == pytest.approx(10.0)
@@ -209,7 +209,7 @@ def test_what_cannot_be_told_apart_is_named_together():
     refused = trial(EffectLocation("dead_zone", "input"), **GOOD | {"train": 0.0}, seed=4)
     winner, rivals = choose([far, close, refused, best], BASE, MEASURED, NOISE)
     assert winner is best and rivals == [close]
-    # The same difference without scatter is beyond doubt, where both leave little more than noise.
+    # The same difference without scatter distinguishes them, if both leave little more than noise.
     near = GOOD | {"windows": 1.5}
     best = trial(DRAG, **near | {"held_out": 210.0, "train": 210.0}, seed=1)
     steady = trial(HARDENING, **near | {"held_out": 200.0, "train": 200.0}, seed=1)
@@ -217,12 +217,12 @@ def test_what_cannot_be_told_apart_is_named_together():
 
 
 def test_of_what_cannot_be_told_apart_dry_friction_goes_first():
-    """Whether it leads or not, and with whatever number of parameters."""
+    """It is chosen even if it does not lead and has more parameters."""
     drag = trial(DRAG, **GOOD | {"held_out": 210.0, "train": 210.0}, seed=1)
     close = GOOD | {"held_out": 200.0, "train": 200.0, "scatter": 3.0}
     friction = trial(ARM, **close, seed=2, numbers=4)
     assert choose([drag, friction], BASE, MEASURED, NOISE) == (friction, [drag])
-    # Where the parameters of predictions make its runs a tenth worse, it may be a stand-in.
+    # If its free runs with the parameters of predictions are a tenth worse, it may imitate another effect.
     for share, first in ((0.99, True), (1.01, False)):
         windows = 5.0 * np.exp(share * selection.WINDOWS_APART)
         slower = trial(ARM, **close | {"windows": windows}, seed=2)
@@ -230,18 +230,19 @@ def test_of_what_cannot_be_told_apart_dry_friction_goes_first():
 
 
 def test_a_rival_need_not_pass_what_the_winner_passed():
-    """Small effects: the winner just passes, the truth just fails, and nothing tells the two apart."""
+    """A candidate that just fails is reported beside the winner if the two are not distinguished."""
     best = trial(DRAG, **GOOD | {"held_out": 30.0, "train": 30.0, "scatter": 1.0}, seed=1)
     missed = trial(ARM, **GOOD | {"held_out": 4.0, "train": 25.0, "scatter": 1.0}, seed=2)
     assert not admissible(missed, BASE, MEASURED, NOISE)
     assert choose([missed, best], BASE, MEASURED, NOISE) == (best, [missed])
-    # One that gains nothing is none, nor one whose free runs are clearly worse.
+    # A candidate that gains nothing is no rival, nor one whose free runs are clearly worse.
     assert choose([trial(ARM, held_out=-4.0, train=25.0, scatter=1.0), best], BASE, MEASURED, NOISE)[1] == []
     far = trial(ARM, **GOOD | {"held_out": 4.0, "train": 25.0, "scatter": 1.0, "windows": 5.0 * 1.2}, seed=2)
     assert choose([far, best], BASE, MEASURED, NOISE) == (best, [])
 
 
 def test_both_sides_tell_apart():
+    """Blocks of training and validation data together distinguish what validation data alone do not."""
     best = trial(DRAG, **GOOD | {"held_out": 201.0, "train": 400.0, "scatter": 1.0})
     close = trial(ARM, **GOOD | {"scatter": 1.0}, seed=2)
     assert paired_gain(best.blocks, close.blocks)[1] < selection.SEPARATE_Z
@@ -255,14 +256,14 @@ def test_the_simpler_effect_wins_unless_the_richer_earns_it():
     plain = trial(COULOMB, **GOOD, seed=1)
     little = trial(STRIBECK, **GOOD | {"held_out": 206.0, "train": 206.0}, seed=1, numbers=3)
     winner, rivals = choose([little, plain], BASE, MEASURED, NOISE)
-    assert winner is plain and rivals == []  # nor is it named as a rival of itself
+    assert winner is plain and rivals == []  # the richer effect is no rival of the simpler one
     much = trial(STRIBECK, **GOOD | {"held_out": 300.0, "train": 300.0}, seed=1, numbers=3)
     winner, rivals = choose([plain, much], BASE, MEASURED, NOISE)
     assert winner is much and rivals == []
-    # At another port it is another effect, which must gain as much with as many parameters.
+    # At another port it is no special case: with as many parameters, the larger gain wins.
     elsewhere = trial(ARM, **GOOD, seed=1, numbers=3)
     assert choose([elsewhere, little], BASE, MEASURED, NOISE)[0] is little
-    # Where the simpler one is refused, the richer stands alone.
+    # If the simpler one is refused, the richer one wins.
     weak = trial(COULOMB, **GOOD | {"windows": 11.0}, seed=1)
     assert choose([weak, little], BASE, MEASURED, NOISE)[0] is little
 
@@ -272,7 +273,7 @@ def test_the_simpler_effect_wins_unless_the_richer_earns_it():
 
 @pytest.fixture(scope="module")
 def sides():
-    """Trained baseline, and the held-out side: the same machine, other inputs, other offsets."""
+    """Training data, fitted baseline, and validation data of the same machine with other inputs."""
     train = sp.problem(sp.recordings(sp.records(0.0)))
     unseen = sp.recordings(sp.records(0.0, (31, 32)))
     validation = ValidationSet(sp.problem(unseen), 0.8)
@@ -284,11 +285,11 @@ def test_held_out_likelihood_of_the_truth(sides):
     train, h, validation = sides
     found = validate(validation, h)
     assert found.blocks.shape == (6,)  # 1.6 s each: three blocks, the rest in the last
-    # What the trained covariance promises per sample, within its scatter.
+    # The log-likelihood per sample agrees with that of the training data.
     promised = h.log_likelihood / np.sum(train.seen)
     per_sample = found.log_likelihood / np.sum(validation.problem.seen)
     assert per_sample == pytest.approx(promised, abs=0.2)
-    # Physics stays, offsets and first states are each recording's own.
+    # Physical parameters are kept, offsets and first states are fitted for each recording.
     np.testing.assert_array_equal(found.adapted.z, h.z)
     assert found.adapted.whitener is h.whitener
     bias = validation.problem.supermodel.parameter_indices(EffectLocation("voltage_offset", "input"))[0]
@@ -330,7 +331,7 @@ def test_errors_of_windows_leave_out_what_a_model_has_seen(sides):
     for r in validation.problem.dataset.recordings:
         run = r.y.copy()
         in_window = np.arange(r.N) % 320
-        run[in_window < r.n_init] += 7.0  # seen: does not count
+        run[in_window < r.n_init] += 7.0  # used for the first state: does not count
         run[in_window >= r.n_init] += [0.03, -0.04]
         runs.append(run)
     assert all(isinstance(r, Recording) and r.N == 640 for r in validation.problem.dataset.recordings)
@@ -340,7 +341,7 @@ def test_errors_of_windows_leave_out_what_a_model_has_seen(sides):
 
 
 def test_runs_that_diverge_are_worse_than_all_others() -> None:
-    """However much their predictions gain, and whatever their first half seconds say."""
+    """A candidate whose free runs diverge is refused, whatever gains its blocks have."""
     gained = {"held_out": 100.0, "train": 100.0}
     diverged = dataclasses.replace(of_free_runs(windows=np.inf), parameter_count=9)
     steady = at_both({"windows": 5.0}, {"windows": 5.0}, DAHL)
@@ -363,7 +364,7 @@ def test_of_two_that_nothing_distinguishes_the_one_with_fewer_parameters_leads()
     assert not distinguished(many, few)
     winner, rivals = choose([many, few], BASE, MEASURED, NOISE)
     assert winner is few and rivals == [many]
-    # As many parameters: the larger gain. Beyond doubt better: the better one, whatever it takes.
+    # With equal numbers the larger gain wins. If distinguished, the better one wins with any number.
     assert choose([many, dataclasses.replace(few, parameter_count=2)], BASE, MEASURED, NOISE)[0] is many
     better = trial(ARM, held_out=400.0, train=400.0, windows=5.0, scatter=3.0, seed=2, numbers=2)
     assert distinguished(better, few) and choose([better, few], BASE, MEASURED, NOISE) == (better, [])
@@ -375,7 +376,7 @@ def test_of_two_that_nothing_distinguishes_the_one_with_fewer_parameters_leads()
 def test_a_model_that_leaves_much_does_not_distinguish_effects_that_gain_nearly_the_same(
     share, windows, alike
 ):
-    """The same lead beyond doubt: it counts where it is a large part of the gain, or nothing else is left."""
+    """A certain lead counts only if it is a large share of the gain, or if errors are near the noise."""
     strong = trial(ARM, held_out=1000.0, train=1000.0, windows=windows)
     weak = trial(COULOMB, held_out=1000.0 * share, train=1000.0 * share, windows=windows)
     assert distinguished(strong, weak)
@@ -384,14 +385,14 @@ def test_a_model_that_leaves_much_does_not_distinguish_effects_that_gain_nearly_
     assert choose([*few], BASE, MEASURED, NOISE)[0] is few[alike]
 
 
-# What decides about a limit is so far from it, as a share of it.
+# Distance of the tested value from its limit, as a share of the limit.
 ASIDE = 2e-3
 SIDES = pytest.mark.parametrize("side", [1 - ASIDE, 1 + ASIDE], ids=["below", "above"])
 PLENTY = {"held_out": 2000.0, "train": 2000.0, "windows": 5.0}
 
 
 def scatter_for(z: float, nats: float) -> float:
-    """Deviation of the lead of a block (without its degree of freedom) with which a lead has this z."""
+    """Standard deviation of the lead of a block (divided by N) for which a lead of `nats` has this z."""
     return nats / z / np.sqrt(BLOCKS) * np.sqrt((BLOCKS - 1) / BLOCKS)
 
 
@@ -438,7 +439,7 @@ def test_near_is_twice_the_noise(side: float) -> None:
 
 
 def of_free_runs(windows: float = 5.0, z: float = 50.0, train_z: float = 50.0):
-    """A candidate that predictions do not want, with free runs of this certainty."""
+    """A candidate without a gain in predictions, whose free runs lead with these values of z."""
     runs = {"windows": windows, "held_out": 50.0, "train": 50.0}
     found = at_both({"windows": 10.0}, runs, COULOMB)
     pattern = np.random.default_rng(7).normal(size=BLOCKS)
@@ -465,7 +466,7 @@ def test_free_runs_alone_fall_by_a_tenth(side: float) -> None:
 
 @SIDES
 def test_two_effects_are_two_deviations_apart(side: float) -> None:
-    """Both sides together are 240 blocks of the same pattern."""
+    """Training and validation data together are 240 blocks of the same pattern."""
     lead, n = 40.0, 2 * BLOCKS
     s = 2 * lead / (2.0 * side) / np.sqrt(n) * np.sqrt((n - 1) / n)
     a = trial(COULOMB, held_out=200.0 + lead, train=200.0 + lead, windows=5.0, scatter=s)
@@ -480,7 +481,7 @@ def test_or_their_free_runs_are_a_tenth_apart(side: float) -> None:
 
 
 def richer_wins(**changes: float) -> bool:
-    """Whether Stribeck friction is taken beside the Coulomb friction that it contains."""
+    """Whether Stribeck friction is chosen over the Coulomb friction that it contains."""
     given = {"held_out": 100.0, "train": 100.0, "windows": 5.0, "scatter": 0.0} | changes
     plain = trial(COULOMB, held_out=2000.0, train=2000.0, windows=5.0)
     lead = {"held_out": 2000.0 + given["held_out"], "train": 2000.0 + given["train"]}
@@ -496,7 +497,7 @@ def test_the_richer_effect_gains_so_many_nats(side: float, what: str, limit: flo
 
 @SIDES
 def test_the_richer_effect_leads_by_two_deviations_of_all_blocks(side: float) -> None:
-    """Both sides together are 240 blocks of the same pattern."""
+    """Training and validation data together are 240 blocks of the same pattern."""
     n = 2 * BLOCKS
     scatter = 200.0 / (2.0 * side) / np.sqrt(n) * np.sqrt((n - 1) / n)
     assert richer_wins(held_out=100.0, train=100.0, scatter=scatter) is (side > 1)
@@ -504,7 +505,7 @@ def test_the_richer_effect_leads_by_two_deviations_of_all_blocks(side: float) ->
 
 @SIDES
 def test_the_richer_effect_has_three_thousandths_of_the_gain(side: float) -> None:
-    """Of a gain of ten thousand nats thirty count, though they are more than ten."""
+    """With a gain of 10 000 nats the limit is 30 nats, above the general limit of 10 nats."""
     plain = trial(COULOMB, held_out=10_000.0, train=10_000.0, windows=5.0)
     more = 10_000.0 * 0.003 * side / (1 - 0.003 * side)
     rich = trial(STRIBECK, held_out=10_000.0 + more, train=10_100.0, windows=5.0, numbers=3)
@@ -585,7 +586,7 @@ def test_or_where_predictions_are_three_and_a_half_deviations_sure(side: float) 
 
 @SIDES
 def test_far_from_the_noise_a_rival_with_nine_tenths_of_the_gain_is_alike(side: float) -> None:
-    """On validation and on training data together, although the likelihood distinguishes the two."""
+    """Gains on validation and training data are added; the likelihood distinguishes the two."""
     strong = trial(ARM, held_out=1000.0, train=1000.0, windows=5.0)
     weak = trial(COULOMB, held_out=900.0 * side, train=900.0, windows=5.0)
     assert distinguished(strong, weak)
@@ -599,7 +600,7 @@ def test_a_horizon_helps_beyond_one_and_a_half_deviations(side: float) -> None:
 
 
 def both_gains():
-    """A candidate and the model before it, with leads by hand at both horizons."""
+    """A candidate and the model before it, with given leads at both horizons."""
     predicts = {"held_out": 40.0, "train": 60.0, "windows": 5.0, "scatter": scatter_for(4.0, 40.0)}
     runs = {"held_out": 20.0, "train": 30.0, "windows": 2.0, "scatter": scatter_for(5.0, 20.0)}
     return at_both(predicts, runs, COULOMB), at_both({"windows": 10.0}, {"windows": 8.0})
@@ -615,7 +616,7 @@ def test_gains_at_both_horizons_are_told_with_their_certainty() -> None:
     said += "free-run error 0.5 times as large"
     more = "; fitted to free runs 0.25 times (z 5.0, training 7.5)"
     assert describe(candidate, before).endswith(said.partition(": ")[2] + more)
-    # Where one of the two was fitted to predictions alone, they are all there is.
+    # If one of the two was fitted to predictions alone, only predictions are reported.
     for pair in (
         (dataclasses.replace(candidate, free_run=None), before),
         (candidate, dataclasses.replace(before, free_run=None)),
@@ -629,7 +630,7 @@ def test_shares_of_the_most_add_up_over_the_horizons() -> None:
     half = at_both({"held_out": 20.0}, {"held_out": 15.0}, ARM)
     worse = at_both({"held_out": -9.0}, {"held_out": -9.0}, ARM)
     np.testing.assert_allclose(shares_of_gain([candidate, half, worse], before), [2.0, 0.5 + 0.75, 0.0])
-    # One without free runs leaves the comparison to predictions.
+    # If a candidate has no free runs, only predictions are compared.
     alone = dataclasses.replace(half, free_run=None)
     np.testing.assert_allclose(shares_of_gain([candidate, alone], before), [1.0, 0.5])
 
@@ -640,7 +641,11 @@ AHEAD = {"held_out": 1.0, "train": 1.0}
 @SIDES
 @pytest.mark.parametrize("what", ["windows", "scatter", "held_out", "train"])
 def test_a_law_takes_the_place_of_another_one_where_both_horizons_prefer_it(side: float, what: str) -> None:
-    """Free runs by a tenth; predictions by two deviations of all blocks, 5 nats, and 8 after the penalty."""
+    """Four limits must be exceeded.
+
+    Errors of free runs must be smaller by a tenth. Predictions must gain by two standard deviations of all
+    blocks, by 5 nats on validation data, and by 8 nats after the penalty on training data.
+    """
     limits = {
         "windows": 5.0 * np.exp(-0.1 * side),
         "scatter": 200.0 / (2.0 * side) / np.sqrt(2 * BLOCKS) * np.sqrt((2 * BLOCKS - 1) / (2 * BLOCKS)),
@@ -655,7 +660,7 @@ def test_a_law_takes_the_place_of_another_one_where_both_horizons_prefer_it(side
 
 @pytest.mark.parametrize("kind", ["held_out", "train"])
 def test_a_law_that_free_runs_speak_against_takes_no_place(kind: str) -> None:
-    """Of training data as well as of validation data, whatever predictions say."""
+    """Worse free runs over training or over validation data are enough to refuse it."""
     found = at_both({"windows": 5.0}, {"windows": 5.0}, COULOMB)
     given = {"held_out": 100.0, "train": 100.0, "windows": 3.0}
     for lead, taken in ((1.0, True), (-1.0, False)):
@@ -669,7 +674,10 @@ def test_a_law_that_free_runs_speak_against_takes_no_place(kind: str) -> None:
 def test_a_law_takes_the_place_where_free_runs_insist_and_predictions_do_not_object(
     side: float, what: str
 ) -> None:
-    """Free runs of both data by 2.5 deviations and a tenth; predictions lose less than two."""
+    """Free runs lead by 2.5 standard deviations on both data sets, with errors smaller by a tenth.
+
+    Predictions lose less than two standard deviations.
+    """
     z_is_one = np.sqrt(BLOCKS) * np.sqrt(BLOCKS / (BLOCKS - 1))
     limits = {"windows": 5.0 * np.exp(-0.1 * side), "held_out": 2.5 * side * z_is_one}
     limits["train"] = limits["held_out"]
@@ -781,8 +789,8 @@ def lead(a: ValidatedHypothesis, b: ValidatedHypothesis = BASE) -> tuple[float, 
     ids=lambda x: x if isinstance(x, str) else "",
 )
 def test_what_is_exactly_at_a_limit(monkeypatch, name, value, decides, expected) -> None:
-    """Only what exceeds a limit passes; two effects are distinguished from it on."""
-    if expected is None:  # the error must fall by the limit at least
+    """A value at its limit does not pass, except at `SEPARATE_Z` and `FREE_RUN_BETTER`."""
+    if expected is None:  # a fall of the error by exactly the limit is enough
         value = -float(np.mean(np.log(RUNS.free_run.window_rmse / FAR.free_run.window_rmse)))
         expected = UP_TO
     assert at_the_limit(monkeypatch, name, value, decides) == expected
@@ -802,7 +810,7 @@ def test_a_rival_gains_something_on_either_side() -> None:
         assert choose([none, best], BASE, MEASURED, NOISE) == (best, [])
 
 
-# -- rivals in the place of an effect of a model that leaves much -----------------------------------------
+# -- rivals in the place of an effect of a poor model -----------------------------------------------------
 
 LUGRE, DAHL = EffectLocation("lugre", "hub"), EffectLocation("dahl", "hub")
 MORE_NEEDED = selection.TRAIN_NATS + np.log(2 * N)  # of two further parameters
@@ -811,7 +819,7 @@ SQRT_2 = 2.0**0.5
 
 
 def in_place(location=DAHL, z=4.0, windows=10.0, numbers=3, better=False, **lead: float):
-    """A model with another law in the place of Stribeck friction, free runs apart by so many deviations."""
+    """A model with another law in the place of Stribeck friction; free runs differ by `z` deviations."""
     predicts = {"held_out": -50.0, "train": -50.0, "windows": 20.0} | lead
     gain = 100.0 if better else -100.0
     runs = {"held_out": gain, "train": gain, "windows": windows, "scatter": scatter_for(z, 100.0)}
@@ -825,25 +833,25 @@ def remains(other: ValidatedHypothesis, left: float = LEFT) -> bool:
 
 @SIDES
 def test_predictions_exclude_a_law_by_more_than_they_leave(side: float) -> None:
-    """Training and validation data together, and beyond doubt."""
+    """The summed loss on training and validation data must exceed `left`, by two standard deviations."""
     assert remains(in_place(held_out=-200.0, train=-300.0 * side)) is (side < 1)
     assert remains(in_place(held_out=-200.0 * side, train=-300.0)) is (side < 1)
-    # Two deviations of all blocks together, twice as many as on either side.
+    # Two standard deviations of all blocks, of training and validation data together.
     scatter = 800.0 / (2.0 * side) * np.sqrt(2 * BLOCKS - 1) / (2 * BLOCKS)
     assert remains(in_place(held_out=-400.0, train=-400.0, scatter=scatter)) is (side < 1)
 
 
 @SIDES
 def test_free_runs_exclude_a_law_that_differs_by_more_than_is_left(side: float) -> None:
-    """Its errors are larger by the root of two, beyond doubt on training and on validation data."""
+    """Its errors are larger by the square root of two, and both data sets agree by 2.5 deviations."""
     assert remains(in_place(windows=10.0 * np.exp(side * np.log(SQRT_2)))) is (side < 1)
     assert remains(in_place(windows=20.0, z=2.5 * side)) is (side < 1)
 
 
 @SIDES
 def test_a_generalisation_does_better_on_both_kinds_of_data(side: float) -> None:
-    """By what its parameters cost, or, however little it gains, beyond doubt."""
-    vague = 200.0  # of the scatter: far from two deviations
+    """It gains more than the penalty for its parameters, or its gain is certain, however small."""
+    vague = 200.0  # scatter of a block: the lead is far below two standard deviations
     more = in_place(LUGRE, numbers=5, held_out=10.0, train=side * MORE_NEEDED, scatter=vague)
     assert remains(more) is (side > 1)
     slight = in_place(LUGRE, numbers=5, held_out=10.0 * (side - 1.0), train=100.0, scatter=vague)
@@ -851,15 +859,15 @@ def test_a_generalisation_does_better_on_both_kinds_of_data(side: float) -> None
     sure = {"held_out": 3.0, "train": 3.0, "scatter": scatter_for(2.0 * side, 3.0)}
     assert remains(in_place(LUGRE, numbers=5, **sure)) is (side > 1)
     assert not remains(in_place(LUGRE, numbers=5, **sure | {"train": -3.0, "scatter": 0.0}))
-    # Or at the other horizon.
+    # Or free runs prefer it with certainty.
     assert remains(in_place(LUGRE, numbers=5, windows=9.0, z=2.0 * side, better=True)) is (side > 1)
-    # Beside a special case or another law there is nothing to be better at.
+    # A special case or another law need not be better.
     assert remains(in_place(COULOMB, numbers=1)) and remains(in_place(DAHL, numbers=2))
 
 
 @pytest.mark.parametrize("found", [[STRIBECK], [STRIBECK, DRAG]], ids=["alone", "beside another"])
 def test_a_rival_of_a_round_must_hold_beside_the_other_effects(monkeypatch, found) -> None:
-    """In the place of what was found, it is refused by free runs or by the likelihood."""
+    """In the place of the effect found, free runs or the likelihood exclude it; a single effect keeps all."""
     final = trial(None, 1000.0, 1000.0, 1.5)
     in_place = {
         EffectLocation("dead_zone", "input"): trial(None, 1000.0, 1000.0, 1.12 * 1.5),
@@ -880,7 +888,7 @@ def test_a_rival_of_a_round_must_hold_beside_the_other_effects(monkeypatch, foun
 
 @SIDES
 def test_a_poor_model_leaves_twice_the_noise(side: float) -> None:
-    """With the parameters that suit its free runs best."""
+    """Of its two sets of parameters, the one with the better free runs counts."""
     assert selection.is_poor(trial(None, windows=2.0 * side), NOISE) is (side > 1)
     assert not selection.is_poor(trial(None, windows=2.0), NOISE)
     assert selection.is_poor(at_both({"windows": 9.0}, {"windows": 2.0 * side}), NOISE) is (side > 1)
@@ -911,7 +919,7 @@ def test_first_states_come_from_a_generalisation_that_does_better(
 def test_an_effect_without_which_validation_runs_are_clearly_worse_is_needed(
     rise: float, needed: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A tenth, though the training recordings are as well off without it; the better horizon counts."""
+    """Validation errors rise by a tenth without it, though training data lose nothing by it."""
     blocks, runs_problem = np.zeros(12), SimpleNamespace(supermodel=None)
     without = SimpleNamespace(blocks=blocks)
     monkeypatch.setattr(stepwise, "refit_without", lambda problem, h, locations, alternations: [without])

@@ -1,4 +1,4 @@
-"""A super-model runs on the part of it that is switched on, and says the same there."""
+"""Only the active part of a super-model is run, with the same results as the whole."""
 
 import dataclasses
 import functools
@@ -45,12 +45,12 @@ SETS = {
 
 @functools.cache
 def supermodel() -> SuperModel:
-    """A baseline that has states of two kinds itself, with candidates that bring more of both."""
+    """A baseline with states of linear effects and of memories, and candidates with more of both."""
     baseline = paper(inductance=0.18e-3, joint_damping=1e-3) + fx.Dahl("arm", 0.004, 0.01)
     return build(baseline, WANTED, SCALES)
 
 
-# All samples of both recordings belong to one window each.
+# Each of the two recordings is one window.
 ONE_RUN = np.zeros((2, N), np.int32)
 
 
@@ -61,13 +61,13 @@ def predictor(between: str = "held") -> BatchedPredictor:
     y = np.stack([simulate(paper(stiffness=1.5), v, Ts) for v, Ts in zip(u, TS, strict=True)])
     y = y + 5e-4 * rng.normal(size=y.shape)
     seen = 1.0 * (rng.random((2, N)) < 0.95)
-    seen[0, 2 * N // 3 :] = 0.0  # as where the first seconds alone count
+    seen[0, 2 * N // 3 :] = 0.0  # as if only the first seconds counted
     data = StackedRecordings(u, y, seen, np.array(TS))
     return BatchedPredictor(supermodel(), Exponential(between=between), data)
 
 
 def numbers(name: str) -> ParameterSet:
-    """Numbers of a set for the whole super-model, each recording with its own offsets and first state."""
+    """Parameters of a set for the whole super-model; offsets and first states differ between recordings."""
     s, rng = supermodel(), np.random.default_rng(1)
     values, size = np.tile(s.mechanism.values, (2, 1)), Layout.of(s.mechanism.structure).size
     values[:, s.local] = 0.01 * rng.normal(size=(2, len(s.local)))
@@ -75,19 +75,19 @@ def numbers(name: str) -> ParameterSet:
     for r, Ts in enumerate(TS):
         K[r, s.baseline_states] = kalman_gains(s.baseline, [PROCESS], [5e-4, 5e-4], Ts)[0]
     gates = s.gates(s.calibrations + SETS[name])
-    x0[:, list(s.active(gates).states)] = 0.1  # at rest what is off
+    x0[:, list(s.active(gates).states)] = 0.1  # zero for inactive effects
     return ParameterSet(values, (x0 * rng.normal(size=x0.shape))[:, None], gates, K)
 
 
 def parameter_set(name: str) -> ParameterSet:
-    """The same as the batched predictor takes it: the first state is that of the part that runs."""
+    """The same for the batched predictor, with the first state of the active part alone."""
     whole = numbers(name)
     return whole._replace(x0=whole.x0[..., list(supermodel().active(whole.gates).states)])
 
 
 @functools.cache
 def program(between: str):
-    """Innovations of the whole super-model by ordinary scans, and their slopes as JAX makes them."""
+    """Innovations of the whole super-model by `jax.lax.scan`, and their derivatives by `jax.jvp`."""
     structure, solver = supermodel().mechanism.structure, Exponential(between=between)
     step = PredictorStep(structure, solver)
 
@@ -106,7 +106,7 @@ def program(between: str):
         at = (whole.values, whole.gates)
         return e(*at), jax.vmap(lambda dv, dg: jax.jvp(e, at, (dv, dg))[1])(dvalues, dgates)
 
-    # It runs a few times only, so time spent on making it fast is lost.
+    # It runs a few times only, so that optimisation by the compiler does not pay.
     rough = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
     return jax.jit(run, compiler_options=rough)
 
@@ -119,7 +119,7 @@ def whole_run(whole: ParameterSet, along: Directions, between: str = "held") -> 
 
 
 def directions(name: str, *names: str) -> Directions:
-    """Along parameters by a tenth of their values, in the first state not at all; always five."""
+    """Five directions: a tenth of each named parameter, and zeros; none changes the first state."""
     m, on = supermodel().mechanism, parameter_set(name)
     sizes = ((2, len(m.values)), on.x0.shape[-1:], on.gates.shape)
     d = Directions(*(np.zeros((5, *size)) for size in sizes))
@@ -129,7 +129,7 @@ def directions(name: str, *names: str) -> Directions:
     return d
 
 
-# -- where things are ---------------------------------------------------------------------------
+# -- layout of states and parameters ------------------------------------------------------------
 
 
 def test_states_of_linear_effects_come_first_then_memories():
@@ -185,7 +185,7 @@ def test_candidates_that_could_not_act_are_left_out():
     }
 
 
-# -- what they say ------------------------------------------------------------------------------
+# -- innovations and derivatives ----------------------------------------------------------------
 
 
 def test_innovations_on_parts_are_those_of_the_whole():
@@ -211,9 +211,9 @@ def test_slopes_on_parts_are_those_of_the_whole():
 
 @pytest.mark.parametrize("between", ["held", "switched"])
 def test_probes_are_the_slopes_of_the_whole(between: str):
-    """Along amplitudes of what is off, and along the gate of the lag, which has no amplitude."""
+    """Derivatives along amplitudes of inactive effects, and along the gate of the lag without amplitude."""
     s, now, put = supermodel(), parameter_set("one memory"), numbers("one memory")
-    # States of what is off are not corrected: gains are those of the baseline.
+    # States of inactive effects are not corrected: gains are those of the baseline.
     K = np.zeros_like(now.K)
     K[:, s.baseline_states] = now.K[:, s.baseline_states]
     now, put = now._replace(K=K), put._replace(K=K)

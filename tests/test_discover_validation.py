@@ -1,4 +1,4 @@
-"""Held-out likelihood: what the training data say of a model's size of error does not count elsewhere."""
+"""Likelihood of validation data: the covariance of innovations found on training data does not count."""
 
 import dataclasses
 
@@ -13,7 +13,7 @@ from rotflex_jax.discover.validation import ValidationSet, validate
 
 @pytest.fixture(scope="module")
 def sides():
-    """A trained baseline, and the held-out side: the same machine, other inputs."""
+    """Training data, fitted baseline, and validation data of the same machine with other inputs."""
     train = sp.problem(sp.recordings(sp.records(0.0)))
     unseen = sp.recordings(sp.records(0.0, (31, 32)))
     return (
@@ -24,7 +24,7 @@ def sides():
 
 
 def test_a_model_that_fits_its_training_data_closely_is_not_punished_for_it(sides):
-    """Ten times as small in training: in units of that, each held-out sample would lose some 50 nats."""
+    """If scaled by training errors ten times as small, each measured value would lose about 47 nats."""
     _, h, validation = sides
     close = Whitener(10 * h.whitener.L)
     plain, proud = validate(validation, h), validate(validation, dataclasses.replace(h, whitener=close))
@@ -32,7 +32,7 @@ def test_a_model_that_fits_its_training_data_closely_is_not_punished_for_it(side
 
 
 def test_the_size_of_the_innovations_is_that_of_the_held_out_recordings(sides):
-    """The likelihood is that of a normal law with the covariance found there: a closed form."""
+    """The likelihood is that of a normal distribution with the covariance found there: a closed form."""
     _, h, validation = sides
     found = validate(validation, h)
     problem = validation.problem
@@ -47,7 +47,7 @@ def test_a_model_that_diverges_on_held_out_data_is_refused(sides):
     train, h, validation = sides
     i = train.supermodel.mechanism.parameter_names.index("hub.motor.torque_constant")
     z = h.z.copy()
-    z[i] = 400.0  # as large as the numbers go
+    z[i] = 400.0  # large enough for the model to diverge
     lost = validate(validation, dataclasses.replace(h, z=z))
     lost = dataclasses.replace(lost, location=sp.HUB, parameter_count=1)
     assert not np.isfinite(lost.window_rmse).all() and np.isfinite(lost.blocks).all()

@@ -1,4 +1,4 @@
-"""The graded end of a search: by one rule in sentence, tile, table and JSON; numbers and names that agree."""
+"""Verdict and grade of a search: the same in sentence, tile, table and JSON; names of effects."""
 
 import dataclasses
 import re
@@ -31,7 +31,7 @@ NAN = float("nan")
 
 
 def ended(times: float, nats: float = 0.0, verdict: Verdict = Verdict.UNEXPLAINED):
-    """A search whose final error is so many times the noise, from a baseline at a thousand times."""
+    """A search whose final error is `times` the noise, from a baseline at 1000 times the noise."""
     found = two_rounds()
     channels = found.baseline.held_out_rmse_windows
 
@@ -118,7 +118,7 @@ def test_names_of_effects_are_nouns_of_the_field(monkeypatch) -> None:
     assert with_titles("coulomb_asymmetric at the hub, lag at input") == (
         "asymmetric Coulomb friction at the hub, input lag"
     )
-    # What has been named stays as it is, and an ordinary word is no name.
+    # Titles are kept, and ordinary words are not replaced.
     for text in (
         "Cubic spring at the joint and Coulomb friction at the hub.",
         "The spring at the joint hardens.",
@@ -130,9 +130,9 @@ def test_names_of_effects_are_nouns_of_the_field(monkeypatch) -> None:
     assert sentence("Coulomb friction at the hub explains it") == "Coulomb friction at the hub explains it."
     titles = [kind.title for kind in CATALOG.values()]
     assert len(set(titles)) == len(titles)
-    for title in titles:  # a noun, no sentence about it
+    for title in titles:  # a noun phrase, not a sentence
         assert not re.search(r"\b(that|which|is|with another)\b|[,()]", title), title
-    # Nothing that a reader sees has the names that scripts use.
+    # Text for readers does not contain the names that scripts use.
     monkeypatch.setattr("rotflex_jax.report.page.pictures", lambda *given: {})
     # The name for scripts stands beside the title of a card, as code.
     page = re.sub(r"<code.*?</code>", "", render(ended(3.0)))
@@ -189,7 +189,7 @@ def test_what_is_exactly_at_a_limit_of_the_end_is_beyond_it() -> None:
     below = dataclasses.replace(end, remaining={"theta": np.nextafter(near, 0)})
     assert below.at_noise and below.is_explained
     assert not dataclasses.replace(below, torque_nats=TORQUE_NATS).torque_free
-    # A channel of unknown noise decides where the others are at theirs, not where one is at the limit.
+    # A channel of unknown noise decides if the others are at their noise, not if one is at the limit.
     unknown = {"alpha": NAN}
     assert (
         "noise of alpha is not known"
@@ -197,12 +197,12 @@ def test_what_is_exactly_at_a_limit_of_the_end_is_beyond_it() -> None:
     )
     assert "error of theta" in dataclasses.replace(end, remaining=end.remaining | unknown).criterion
     assert [percent_explained(share) for share in (99.99, 99.0, 0.0)] == ["99.99 %", "99.0 %", "0 %"]
-    # Of a baseline without an error nothing can be explained.
+    # If the baseline has no error, the explained share is undefined.
     assert np.isnan(assess({"theta": 0.0}, {"theta": 1.0}, {"theta": 1.0}, 0.0).explained["theta"])
 
 
 def test_the_misfit_is_what_is_left_over_what_the_verdict_allows() -> None:
-    """Squares of errors, nats as they are; one where both are allowed, infinite where one is unknown."""
+    """The larger of squared error ratio and ratio of nats; at least 1, infinite if the noise is unknown."""
 
     def misfit(theta: float, nats: float) -> float:
         return Assessment({}, {"theta": theta * NEAR_FLOOR, "alpha": 0.5}, nats * TORQUE_NATS).misfit

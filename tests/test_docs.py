@@ -1,4 +1,4 @@
-"""The documentation: what it quotes is really said, what it shows runs, what it links to is there."""
+"""Documentation: quoted messages are raised, examples run, and links lead to existing places."""
 
 import contextlib
 import importlib
@@ -67,7 +67,7 @@ def latin() -> str:
 
 
 def without(package: str, do: Callable[[], object]) -> object:
-    """As on a machine that lacks a package."""
+    """Call a function as on a machine that lacks a package."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(sys.modules, package, None)
         return do()
@@ -79,7 +79,7 @@ def hdf5() -> str:
 
 
 def command(*arguments: str) -> None:
-    """The command line; its sentence on stderr as an error."""
+    """Run the command line; raise its message on stderr as an error."""
     said = io.StringIO()
     with contextlib.redirect_stderr(said), pytest.raises(SystemExit) as left:
         app.main(arguments)
@@ -98,7 +98,7 @@ def clipped() -> rf.Recording:
 
 
 def in_the_room() -> rf.Recording:
-    """The demo recording with the angle of the arm in the room."""
+    """The demo recording with the absolute angle of the arm."""
     demo = rf.data.demo_recording()
     return rf.Recording(u=demo.u, y=demo.y @ np.array([[1.0, 1.0], [0.0, 1.0]]), Ts=demo.Ts)
 
@@ -111,7 +111,7 @@ def swapped() -> rf.Recording:
 
 
 def doubted(recording: rf.Recording) -> None:
-    """A warning, which is no refusal, as one."""
+    """Raise the first warning about a recording as an error."""
     raise rf.InputError(next(str(f) for f in recording.findings if f.severity == "warning"))
 
 
@@ -126,7 +126,7 @@ def sindy() -> None:
 
 
 def turned(u: float, *y: float) -> rf.Fit:
-    """A fit of the demo recording with signs turned round."""
+    """A fit of the demo recording with reversed signs of input or outputs."""
     demo = rf.data.demo_recording()
     return rf.fit(rf.joints.paper(), rf.Recording(u=u * demo.u, y=demo.y * y, Ts=demo.Ts))
 
@@ -179,7 +179,7 @@ RAISED: dict[str, Callable[[], object]] = {
     "effect without a port": lambda: command("simulate", file(), "--add", "coulomb"),
 }
 
-# What a search says without a refusal.
+# Messages of a search that are no errors.
 SAID: dict[str, Callable[[], tuple[str, ...]]] = {
     "alpha turned round": lambda: sign_note(
         {"alpha": (np.deg2rad(0.762), np.deg2rad(0.405))}, {"theta": "rad", "alpha": "rad"}, 2.0
@@ -189,7 +189,7 @@ SAID: dict[str, Callable[[], tuple[str, ...]]] = {
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """A folder of its own, and a catalogue that is afterwards what it was."""
+    """An empty folder to work in; afterwards the catalogue is restored."""
     monkeypatch.chdir(tmp_path)
     known = dict(CATALOG)
     yield tmp_path
@@ -219,7 +219,7 @@ def test_every_message_that_is_quoted_is_really_raised_and_the_other_way_round(f
     "page", ["first_look.md", "load_data.md", "add_effect.md", "from_matlab.md", "troubleshooting.md"]
 )
 def test_examples_run_as_they_stand(page: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    # These two set up the process; here the rest of the suite shares it.
+    # These two change settings of the process, which other tests share.
     monkeypatch.setattr(rf, "enable_fast_loops", lambda: True)
     monkeypatch.setattr(rf, "enable_compilation_cache", lambda: None)
     namespace: dict[str, Any] = {"__name__": "example"}
@@ -231,7 +231,7 @@ def test_examples_run_as_they_stand(page: str, folder: Path, monkeypatch: pytest
 
 
 def anchors(page: Path) -> set[str]:
-    """Names that a link may point to in a page: its headings as a code host writes them."""
+    """Anchors of a page: its headings as a code host converts them."""
     titles = re.findall(r"^#+ (.*)$", re.sub(r"^```.*?^```", "", page.read_text(), flags=re.S | re.M), re.M)
     return {re.sub(r"[^\w\- ]", "", t.replace("`", "").lower()).replace(" ", "-") for t in titles}
 
@@ -248,7 +248,7 @@ def test_relative_links_lead_somewhere(page: Path) -> None:
         if not there.exists() or (anchor and there.suffix == ".md" and anchor not in anchors(there)):
             broken.append(target)
     assert broken == []
-    # What is made when the site is built is nowhere on a code host.
+    # Pages that are generated with the site do not exist on a code host.
     assert not re.search(r"\]\((docs/)?(effects|reference)/", text)
 
 

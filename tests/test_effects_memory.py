@@ -1,4 +1,4 @@
-"""Hysteresis, heat, play, ripples and one more mode against scipy's integration of the written equations."""
+"""Hysteresis, heating, play, cogging and a second mode against scipy's integration of their equations."""
 
 import dataclasses
 import functools
@@ -27,7 +27,7 @@ J_HUB, J_ARM, K = 0.0021, 0.0059, 1.61
 RESISTANCE, EMF = 2.6, 0.00767 * 70  # also the torque per current
 exactly = functools.partial(solve_ivp, method="DOP853", rtol=1e-10, atol=1e-13)
 
-# -- the laws, as their sources write them ------------------------------------------------------
+# -- the laws as in their sources ---------------------------------------------------------------
 
 
 def bouc_wen(z, w, width, beta):
@@ -49,13 +49,13 @@ def heating(warm, m, rate, time):
 
 
 LUGRE = {"level": 0.03, "rise": 0.5, "slow": 0.3, "presliding": 0.004, "damping": 0.01}
-HEAT = {"rate": 400.0, "time": 0.3}  # quick and hot, so that a short run shows it
+HEAT = {"rate": 400.0, "time": 0.3}  # fast and strong, so that it shows in a short run
 
-# -- under a motion that is given ---------------------------------------------------------------
+# -- with a given motion ------------------------------------------------------------------------
 
 
 def motion(t):
-    """Speed [rad/s] with reversals of many sizes, and the voltage beside it [V]."""
+    """Speed [rad/s] with reversals of many sizes, and voltage [V]."""
     return 0.5 * np.sin(9 * t) + 0.3 * np.sin(31 * t + 1), 2 * np.cos(5 * t)
 
 
@@ -103,7 +103,7 @@ def test_state_under_a_given_motion(name):
 @pytest.mark.parametrize("beta", [0.0, 0.1, 0.4, 0.9])
 @pytest.mark.parametrize("width", [1e-2, 1e-3, 1e-4, 1e-6])
 def test_a_bouc_wen_state_stays_within_its_limits_where_a_sample_is_many_widths(width, beta):
-    """Reversals at 5 rad/s and 2 ms; a step of the linearised law would end as far out as 1e34."""
+    """Reversals at 5 rad/s and 2 ms; one step of the linearised law would reach values up to 1e34."""
     mechanism, Ts = single_inertia(0.002) + fx.BoucWen("hub", 0.02, width, beta), 0.002
     gates, v = jnp.ones(4), jnp.zeros(())
     for dtype in (jnp.float32, jnp.float64):
@@ -156,14 +156,14 @@ def test_small_swings_on_bristles():
 
 
 def given_by_bristles(friction, w):
-    """Power that the port gets less what the bristles lose, bent by 2 g, where it is largest [W]."""
+    """Power to the port plus power stored [W] at a deflection of 2 g, where this sum is largest."""
     z = 2 * (1 + friction.rise * math.exp(-((w / friction.slow) ** 2)))
     rate, torque = (float(f(z, 0.0, w, 0.0)) for f in (friction.flow, friction.force))
     return torque * w + friction.level * friction.presliding * z * rate
 
 
 def test_lugre_gives_energy_only_beyond_its_known_speed():
-    """The bound of sigma_1(w) |w| against 4 level g is sharp where the bristles are bent by 2 g."""
+    """The bound sigma_1(w) |w| <= 4 level g is sharp at a deflection of 2 g."""
     friction = fx.LuGre("hub", level=0.03, rise=2.0, slow=10.0, presliding=0.004, damping=0.1)
 
     def beyond(w):
@@ -183,7 +183,7 @@ def test_lugre_with_little_damping_gives_no_energy_at_any_speed():
 
 
 def test_a_motor_that_stands_warms_to_a_known_level():
-    """rate z^2 + z = m^2 time: the root of what comes in and what goes out."""
+    """In equilibrium, rate z^2 + z = m^2 time, with the torque m of the cold motor: a closed form."""
     m, rate, time = EMF / RESISTANCE * 2.0, 3.0, 0.4
     lone = single_inertia(0.5, motor=fx.Motor(back_emf=0.0), damping=0.3) + fx.Heating("hub", rate, time)
     s = simulate_states(lone, np.full(1500, 2.0), 0.02)
@@ -206,9 +206,9 @@ def test_heat_needs_a_motor(port):
 
 @dataclasses.dataclass(frozen=True)
 class Case:
-    """Effects, and the same written out: torques on (theta, alpha) and rates of the states they bring.
+    """Effects, and their equations written out: torques on (theta, alpha), and rates of their states.
 
-    `torques(q, w, z, m)` sees the torque `m` of the cold motor at a settled current, as the effects do;
+    `torques(q, w, z, m)` is given the torque `m` of the cold motor at a settled current, like the effects;
     `z` is in the order of `effects`.
     """
 
@@ -280,7 +280,7 @@ SECOND = (8e-4, 14.0, 0.03)
 
 
 def third_mass(q, w, z, m):
-    """Its angle `z[0]` and speed `z[1]` in space."""
+    """The part of the second mode, with absolute angle `z[0]` and speed `z[1]`."""
     inertia, frequency, damping = SECOND
     W = 2 * np.pi * frequency
     accelerated = -(W**2) * (z[0] - q.sum()) - 2 * damping * W * (z[1] - w.sum())
@@ -335,7 +335,7 @@ def test_joint_converges_to_its_written_equations(name):
 
 
 def test_heat_of_a_true_current():
-    """A new voltage every sample, and the current of a real motor, settled within a fiftieth of it."""
+    """The voltage changes every sample; the time constant of the current is about 1/58 of a sample."""
     case = dataclasses.replace(CASES["heating with a current"], inductance=0.18e-3)
     u = np.random.default_rng(3).normal(size=N)
     truth = case.reference(u, Ts, 1, settled=False)
@@ -353,11 +353,11 @@ def test_both_steppers_agree_on_everything():
     np.testing.assert_allclose(mine, classical, rtol=0, atol=2e-5)
 
 
-# -- one more mode ------------------------------------------------------------------------------
+# -- second mode --------------------------------------------------------------------------------
 
 
 def three_masses(inertia, frequency, damping, v_damping=EMF**2 / RESISTANCE):
-    """Hub, arm and part, each by its angle in space; the motor brakes the hub."""
+    """Hub, arm and part by their absolute angles; the motor damps the hub."""
     k, W = inertia * (2 * np.pi * frequency) ** 2, 2 * np.pi * frequency
     c = 2 * damping * W * inertia
     M = np.diag([J_HUB, J_ARM, inertia])
@@ -375,7 +375,7 @@ def by_size(roots):
 def test_three_masses_have_their_eigenvalues():
     A, _ = three_masses(*SECOND)
     found = np.linalg.eigvals(linearise(paper() + _MODE).A)
-    # The part's angle from the port is one number, its place in space another; both systems have six.
+    # One system has the angle of the part from its port, the other its absolute angle; both have six states.
     np.testing.assert_allclose(by_size(found), by_size(np.linalg.eigvals(A)), rtol=1e-9, atol=1e-8)
 
 
@@ -404,7 +404,7 @@ def test_the_part_rings_at_its_own_frequency_on_a_port_that_is_held(port):
 
 
 def test_a_slow_push_moves_the_part_with_its_port():
-    """Far below its frequency the part is so much more inertia."""
+    """Far below its frequency the part acts as additional inertia of its port."""
     inertia = SECOND[0]
     with_part, heavier = paper() + fx.SecondMode("arm", inertia, 2e3, 0.5), paper(arm_inertia=J_ARM + inertia)
     np.testing.assert_allclose(
@@ -412,7 +412,7 @@ def test_a_slow_push_moves_the_part_with_its_port():
     )
 
 
-# -- what every one of them keeps ---------------------------------------------------------------
+# -- properties of every one of them ------------------------------------------------------------
 
 NEW = [_MODE, _HEATING, *_FRICTION, _RIPPLE, _LOOSE]
 NEW += [fx.Delay(time=0.0051), fx.Lag(time=0.006), fx.SensorCubic("alpha", 6.0), fx.Rectifier("alpha", 0.15)]
@@ -445,7 +445,7 @@ def test_single_precision_stays_single():
 
 
 def joined_shapes(jaxpr):
-    """Shapes of what is put together of pieces, in programs inside too."""
+    """Shapes of concatenated and stacked arrays, also in inner programs."""
     for e in jaxpr.eqns:
         if "jaxpr" in e.params:
             yield from joined_shapes(e.params["jaxpr"].jaxpr)
@@ -455,7 +455,7 @@ def joined_shapes(jaxpr):
 
 @pytest.mark.parametrize("effects", [(fx.LuGre("hub"),), (fx.BoucWen("joint"), fx.Dahl("hub"))])
 def test_the_step_has_one_form_for_all_states(effects):
-    """Pieces put together are a branch in the compiled loop over states and directions: four times slower."""
+    """A concatenation is a branch in the compiled loop over states and directions: four times slower."""
     mechanism, solver, D = functools.reduce(lambda m, e: m + e, effects, paper()), Exponential(), 8
     structure, n = mechanism.structure, len(rest_state(mechanism.structure, float))
     c = solver.prepare(

@@ -1,4 +1,4 @@
-"""Sensors that read more than one true value: closed forms, true delays, the predictor, search, C code."""
+"""Sensors that read more than one true value: closed forms, true delays, predictor, fit, search, export."""
 
 import math
 
@@ -50,9 +50,9 @@ def truly_late(machine: Mechanism, u: np.ndarray, late: float) -> tuple[np.ndarr
 @pytest.mark.parametrize("late", [0.25, 1.0, 1.5, 2.0, 3.0])
 @pytest.mark.parametrize("channel", [0, 1, 2])
 def test_one_channel_comes_late(channel, late):
-    """Within 0.5 % of what a position changes by in the meantime, 7 % of a speed, whose corners are rounded.
+    """The error is below 0.5 % of the change of a position during the delay, below 7 % for a speed.
 
-    Under voltages of 5 V that jump every 20 ms.
+    Voltages up to 5 V jump every 20 ms; the filter rounds the corners of the speed.
     """
     machine, u = with_tacho(joint()), steps()
     name = machine.channels[channel]
@@ -66,7 +66,7 @@ def test_one_channel_comes_late(channel, late):
 
 
 def test_the_filter_is_the_pade_approximation_of_a_delay():
-    """Of order (2, 2), for a position and for a speed, by another library."""
+    """Of order (2, 2), for a position and for a speed; reference: `scipy.interpolate.pade`."""
     time = 0.005
     above, below = scipy.interpolate.pade([1 / math.factorial(k) for k in range(5)], 2)
     W = np.geomspace(1.0, 1000.0, 30)
@@ -82,7 +82,7 @@ def test_the_filter_is_the_pade_approximation_of_a_delay():
 
 
 def test_a_late_channel_beside_other_states():
-    """Its states stand among those of a motor current and of a gear with play, each in its place."""
+    """Its states are at the right places among those of a motor current and of a gear with play."""
     plain = paper(inductance=1e-3, joint_damping=0.003)
     u = steps(400)
     for machine in (plain, plain + fx.Backlash("hub", gap=0.004), plain + fx.Coulomb("arm", 0.01)):
@@ -104,7 +104,7 @@ def test_a_late_channel_beside_other_states():
 
 
 def test_a_predictor_follows_a_late_sensor():
-    """Corrected by its own late readings it starts wrong and ends right."""
+    """With corrections by late readings, the error of a wrong first state decays."""
     machine = joint() + fx.ChannelDelay("alpha", time=0.004)
     u = steps(2000)
     y = simulate(machine, u, Ts)
@@ -129,7 +129,7 @@ def test_cross_talk_reads_the_true_other_channel():
 
 
 def test_an_encoder_out_of_centre():
-    """A mark on the rim of a disc that turns about a point beside its centre."""
+    """Reference: the angle of a mark on the rim of a disc that turns about a point beside its centre."""
     radius, beside, phase = 0.02, 0.0001, 0.6
     turn = np.linspace(-3.0, 13.0, 400)
     rim = radius * np.exp(1j * turn) + beside * np.exp(1j * phase)

@@ -1,4 +1,4 @@
-"""Motors under a position loop: against other integrators, an independent servo, and measured ones."""
+"""Motors in a position loop against other integrators, an independent simulator, and measured servos."""
 
 import dataclasses
 from collections.abc import Callable
@@ -41,7 +41,7 @@ def duty(gain: float, error: float, limit: float = 1.0) -> float:
 
 
 def by_solve_ivp(mechanism: rf.Mechanism, goal: np.ndarray) -> np.ndarray:
-    """Angles of the pendulum on the servo, the goal held over each sample."""
+    """Angles of the pendulum on the servo by scipy, with the goal held over each sample."""
     n = mechanism.named_values
     servo = dict.fromkeys(("derivative", "dead_band", "source_resistance"), 0.0)
     servo |= {name.rpartition(".")[2]: value for name, value in n.items() if "position_servo" in name}
@@ -88,7 +88,7 @@ def test_the_closed_loop_agrees_with_another_integrator(gain, solver, error):
     [("derivative", 0.05, 1e-3), ("dead_band", 0.05, 1e-3), ("source_resistance", 2.0, 2e-3)],
 )
 def test_parts_of_other_firmware_and_a_weak_supply(part, value, error):
-    """Each changes the motion by far more than the step is wrong; at zero each is absent."""
+    """Each changes the motion by over 20 times the error of integration; at zero each is absent."""
     servo = lambda x: position_servo(0.007, servo=fx.PositionServo(**{part: x}), weight=0.48)  # noqa: E731
     goal = square(200, size=0.8)
     plain = rf.simulate(position_servo(0.007, weight=0.48), goal, TS)[:, 0]
@@ -128,7 +128,7 @@ def test_the_limit_of_the_duty_sets_the_stall_torque_and_the_speed():
 
 
 def test_the_torque_of_a_motor_under_a_loop_is_that_of_its_current():
-    """What heats the motor: with weight, limit and back-EMF."""
+    """The torque that heats the motor, in closed form with limit and back-EMF."""
     mechanism = xl330_pendulum() + fx.Heating("hub")
     gates = np.ones(len(mechanism.effects))
     for q, v, goal in ((0.1, 2.0, 0.3), (-0.4, -1.0, 1.5), (0.5, 0.0, -1.5)):
@@ -155,7 +155,7 @@ def test_what_acts_on_a_goal_is_told_in_radians():
     units = dict(zip(mechanism.parameter_names, mechanism.parameter_specifications, strict=True))
     assert units["input.dead_zone.positive"].unit == "rad"
     assert units["input.voltage_drift.rate"].unit == "rad/s"
-    assert units["hub.position_servo.supply"].unit == "V"  # these volts are volts
+    assert units["hub.position_servo.supply"].unit == "V"  # the supply is in volts
     assert units["hub.position_servo.torque_constant"].unit == "N m/A"
     said = [mechanism.sentence(mechanism.effect(name, "input")) for name in ("dead_zone", "voltage_drift")]
     assert said[0] == "inputs between -0.1 rad and 0.1 rad have no effect"
@@ -176,13 +176,13 @@ def test_presets_by_name_and_the_role_of_the_port():
     shaft = rf.Mechanism(
         ("q",), {"shaft": (1,)}, [fx.Inertia("shaft"), fx.PositionServo("shaft")], outputs={"q": "shaft"}
     )
-    assert port_roles(shaft, "shaft") == {"hub"}  # its loop is no spring
+    assert port_roles(shaft, "shaft") == {"hub"}  # its loop does not count as a spring
     assert port_roles(shaft + fx.Gravity("shaft"), "shaft") == {"hub", "loaded"}
     assert (fx.GearFriction, "hub") in search_places(xl330_pendulum())
     assert fx.GearFriction not in dict(search_places(rf.joints.paper()))
 
 
-# -- an independent servo: firmware at 1 kHz on whole counts, friction that sticks, steps of 0.1 ms ----------
+# -- an independent simulator: firmware at 1 kHz on whole counts, sticking friction, steps of 0.1 ms ---------
 
 TRUTH = {"J": 0.0065, "kt": 0.42, "R": 4.4, "level": 0.035, "cosine": 0.012}
 FREE = {
@@ -197,14 +197,14 @@ FREE = {
 def servo_run(
     gain: float, goal: np.ndarray, fine: int = 50, lost: float = 0.0, limit: float = np.inf
 ) -> np.ndarray:
-    """Angles; the firmware sees them in whole counts. No code of the toolkit.
+    """Angles of a servo without code of the toolkit; the firmware reads them in whole counts.
 
     Args:
-        gain: Of the firmware.
+        gain: Gain of the firmware.
         goal: Goals [rad].
-        fine: Steps of a sample.
+        fine: Steps per sample.
         lost: Share of the motor's torque that the gear takes as friction.
-        limit: Torque that the motor gives at the most, however large its current [N m].
+        limit: Upper limit of the motor's torque at any current [N m].
     """
     J, kt, R, level, cosine = (TRUTH[k] for k in ("J", "kt", "R", "level", "cosine"))
     h, weight, q, v, out = TS / fine, 0.49 * 9.80665 * 0.1, 0.0, 0.0, []
@@ -238,7 +238,7 @@ def goals(samples: int = 800) -> dict[str, np.ndarray]:
 
 
 def recorded(*runs: tuple[float, str], **physics: float) -> list[Recording]:
-    """Recordings of the independent servo at gains, following goals, with noise and in whole counts."""
+    """Recordings of the independent simulator at given gains and goals, with noise, in whole counts."""
     made = []
     for k, (gain, kind) in enumerate(runs):
         goal = goals()[kind]
@@ -269,7 +269,7 @@ def far_start() -> rf.Mechanism:
 
 
 def test_recordings_with_different_gains_are_fitted_together(servo_recordings):
-    """From a start 30 % off to the truth, each gain known; firmware in whole counts and noise in the log."""
+    """The fit starts 30 to 35 % off and finds the truth; the gain of each recording is known."""
     found = rf.fit(rf.Model(far_start(), rf.Exponential(substeps=4)), servo_recordings)
     assert found.status == "converged"
     for name, key in FREE.items():
@@ -278,11 +278,11 @@ def test_recordings_with_different_gains_are_fitted_together(servo_recordings):
         size = 0.01 if key == "cosine" else TRUTH[key]
         assert found[name].std < 0.05 * size, (key, found[name])
     assert found.noise["theta"] == pytest.approx(NOISE, rel=0.1)
-    assert found[GAIN].value == 333.0 and not found[GAIN].free  # the model's own is left alone
+    assert found[GAIN].value == 333.0 and not found[GAIN].free  # the model's gain is unchanged
     for recording in servo_recordings:
         error = found.model.simulate(recording) - recording.y
         assert np.sqrt(np.mean(error**2)) < 1.5 * NOISE
-    # Without the constants one gain would have to do for all.
+    # Without the constants, one gain is used for all recordings.
     blind = [dataclasses.replace(r, constants={}) for r in servo_recordings]
     assert rf.fit(far_start(), blind).noise["theta"] > 20 * NOISE
 
@@ -319,7 +319,7 @@ def test_constants_that_cannot_be(servo_recordings):
         rf.many_starts(mechanism, servo_recordings[:2])
     with pytest.raises(InputError, match=f"differ in {GAIN}"):
         rf.latent_torque(mechanism, servo_recordings[:2])
-    # A model without such an effect has no use for the constant.
+    # A model without such an effect ignores the constant.
     assert rf.Model(rf.joints.single_inertia()).at(r).mechanism == rf.joints.single_inertia()
 
 
@@ -338,14 +338,14 @@ def test_a_search_runs_each_recording_with_its_gain(servo_recordings):
     run = ParameterSet(values, dataset.first_states[:, None], s.gates(()), K)
     e = problem.innovations_of([run])[0]
     assert np.sqrt(np.mean(e**2)) < 5 * NOISE
-    assert values[0, s.mechanism.parameter_names.index(GAIN)] == 333.0  # what was given is left alone
+    assert values[0, s.mechanism.parameter_names.index(GAIN)] == 333.0  # the given values are unchanged
     alike = dataclasses.replace(problem.predictor, constants=None)
     assert np.sqrt(np.mean(alike.innovations([run], problem.windows.index)[0] ** 2)) > 20 * NOISE
 
 
 @pytest.mark.parametrize("held_back", [True, False], ids=["validation", "one left out"])
 def test_every_part_of_a_search_knows_the_constants_of_each_recording(servo_recordings, held_back):
-    """Training, validation and test recordings have gains of their own, none of them the model's."""
+    """Training, validation and test recordings have different gains, none of them that of the model."""
     a, b, c, d = servo_recordings
     model = rf.Model(true_servo(), rf.Exponential(substeps=4))
     train, validation = ([a, d], [b]) if held_back else ([a, d, b], [])
@@ -371,7 +371,7 @@ def test_every_part_of_a_search_knows_the_constants_of_each_recording(servo_reco
     ids=str,
 )
 def test_a_search_tells_what_a_loaded_motor_loses(physics, wanted):
-    """From the preset, whose values are off: constant friction, a share of the torque, saturation beside."""
+    """From wrong values of the preset it finds constant friction, gear friction, and saturation."""
     train = recorded((200.0, "sums"), (400.0, "sweep"), **physics)
     validation = recorded((200.0, "sweep"), (400.0, "sums"), **physics)
     laws = (fx.Coulomb, fx.GearFriction, fx.TorqueSaturation, fx.Viscous, fx.QuadraticDrag, fx.Heating)
@@ -389,7 +389,7 @@ def test_a_search_tells_what_a_loaded_motor_loses(physics, wanted):
 
 
 def test_a_measured_servo_at_a_gain_that_no_fit_has_seen(measured: Callable[[str], list[Recording]]):
-    """The firmware's gain carries over; dry friction that does not know the load leaves some degrees."""
+    """The fit is valid at another gain; dry friction that ignores the load leaves errors of some degrees."""
     recordings = measured("bam_xl330")
     assert sorted({r.constants[GAIN] for r in recordings}) == [100.0, 200.0, 400.0, 800.0]
     train = [r for r in recordings if r.constants[GAIN] in (100.0, 800.0)]

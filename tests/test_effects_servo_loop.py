@@ -37,9 +37,9 @@ def firmware_run(
     parts: dict[str, float],
     windup: float,
 ) -> np.ndarray:
-    """Angle, current and duty of a servo whose firmware computes once in a millisecond, by plain Python.
+    """Angle, current and duty of a servo whose firmware computes once in a millisecond, in plain Python.
 
-    Current and duty are seen through low-pass filters.
+    Current and duty are read through low-pass filters.
     """
     h, gain = TS / FINE, 400.0 * DYNAMIXEL_GAIN_SCALE
     every = round(1e-3 / h)
@@ -83,12 +83,12 @@ def pid(parts: dict[str, float], windup: float = WINDUP, integral: float = INTEG
 
 @pytest.mark.parametrize("parts", [{}, PARTS], ids=["PI", "PID, dead band, weak supply"])
 def test_the_loop_agrees_with_firmware_at_a_kilohertz(parts):
-    """The duty is at its limit for long, the integral winds up and is led back."""
+    """The duty is at its limit for some time, so that the anti-windup acts on the integral."""
     goal = goals()
     expected = firmware_run(goal, 0.007, 0.35, 3.4, 0.0, parts, WINDUP)
     assert np.mean(np.abs(expected[:, 2]) > 0.9 * LIMIT) > 0.05
     found = rf.simulate(pid(parts), goal, TS)
-    # The D gain of the firmware acts on a difference over a period, half a period late: first order.
+    # The D gain of the firmware acts on a difference over a period, half a period late: a first-order error.
     angle, current, duty = np.max(np.abs(found - expected), axis=0)
     assert angle < 0.004 and current < 0.012 and duty < 0.007
     without = rf.simulate(pid(parts, windup=0.0), goal, TS)
@@ -98,7 +98,7 @@ def test_the_loop_agrees_with_firmware_at_a_kilohertz(parts):
 
 
 def test_derivatives_of_loop_and_readings_equal_central_differences():
-    """Readings follow the motor, which follows the integral: three states, one driving the others."""
+    """The states of the readings depend on the motor, and the motor depends on the state of the integral."""
     m = pid(PARTS) + fx.LoadFriction("hub", level=0.01, driving=0.1, tied=True, of="motor")
     with double_precision():
         u, x0 = jnp.asarray(goals(60)), jnp.asarray(rest_state(m.structure, np.dtype(float)))
@@ -117,7 +117,7 @@ def test_derivatives_of_loop_and_readings_equal_central_differences():
 
 
 def test_an_i_gain_takes_the_error_away_that_the_weight_makes():
-    """At rest the duty holds the weight: supply duty torque_constant / resistance = weight."""
+    """At rest, supply * duty * torque_constant / resistance is the torque of the weight."""
     goal = np.full(2500, 0.5)
     theta, current, duty = rf.simulate(pid({}), goal, TS)[-1]
     assert theta == pytest.approx(0.5, abs=1e-6)
@@ -135,7 +135,7 @@ FREE = {
 
 
 def test_a_current_in_the_log_sets_the_scale_of_all_torques():
-    """From 30 % off: inertia, motor and friction from a log of angle and current, with its noise."""
+    """The fit starts 30 % off and finds inertia, motor and friction from noisy angle and current."""
     goal, rng = goals(600), np.random.default_rng(3)
     run = firmware_run(goal, *(TRUTH[k] for k in ("J", "kt", "R", "level")), {}, WINDUP)
     log = Recording(
@@ -147,7 +147,7 @@ def test_a_current_in_the_log_sets_the_scale_of_all_torques():
         input_unit="rad",
         units=("rad", "A"),
     )
-    # The weight is not known either: nothing but the current says how large torques are.
+    # The weight is free too, so that only the current determines the scale of torques.
     start = pid({}) + fx.Coulomb("hub", level=0.02)
     start = dataclasses.replace(
         start,
@@ -161,14 +161,14 @@ def test_a_current_in_the_log_sets_the_scale_of_all_torques():
         assert found[name].value == pytest.approx(TRUTH[key], rel=0.05), key
         assert found[name].std < 0.05 * TRUTH[key]
     assert found["hub.gravity.sine"].value == pytest.approx(SINE, rel=0.05)
-    # Of the angle alone all torques have a common factor that no recording shows.
+    # With the angle alone, a common factor of all torques is not identifiable.
     alone = dataclasses.replace(start, outputs={"theta": "hub"})
     assert not rf.identifiable(alone).structural
     assert rf.identifiable(start).structural
 
 
 def test_with_the_torque_off_the_arm_falls_freely():
-    """No back-EMF brakes it: the windings are open; a duty of zero would brake."""
+    """With open windings no back-EMF brakes it; a duty of zero would brake. Reference: scipy."""
     machine = servo("xl330", 0.007, weight=SINE)
     falling = Recording(
         u=np.zeros(300),
@@ -176,7 +176,7 @@ def test_with_the_torque_off_the_arm_falls_freely():
         Ts=TS,
         input_name="goal",
         input_unit="rad",
-        accept="constant_input",  # the goal moves nothing
+        accept="constant_input",  # the goal has no effect
         constants={"hub.position_servo.enabled": 0.0},
     )
     off = rf.Model(machine).at(falling).mechanism
@@ -251,13 +251,13 @@ def test_simulators_get_the_motion_and_the_certificate_names_the_rest():
     for text in ("current: the current at hub", "duty: the duty at hub", "integral of 3"):
         assert text in said
     assert exported.certificate.channels == ("theta",)
-    # What a sensor makes of a reading that is left out goes with it.
+    # An effect of a sensor whose reading is left out is left out too.
     calibrated = pid(PARTS) + fx.SensorGain("current", 1.1)
     assert rf.export.to_urdf(calibrated, Ts=TS).content == exported.content
 
 
 def test_a_search_scores_errors_of_a_current_sensor() -> None:
-    """What it looks at beside a model has the meter that the output needs."""
+    """The models that it compares have the meter that the output needs."""
     servo = rf.joints.servo("sts3215", gain=16, sensors="theta+current")
     rng, parts = np.random.default_rng(0), []
     for _ in range(2):

@@ -1,4 +1,4 @@
-"""Measured disturbances: signals beside the input that drive a machine, from the step to the search."""
+"""Measured disturbances: signals beside the input that drive a machine, from integration to search."""
 
 import dataclasses
 
@@ -40,17 +40,16 @@ TS = 0.004
 
 
 def coloured(samples: int, size: float, seed: int, width: int = 15) -> np.ndarray:
-    """Noise that neighbouring samples share, of a standard deviation."""
+    """Low-pass noise with a standard deviation of `size`."""
     x = np.convolve(np.random.default_rng(seed).normal(size=samples + width), np.hanning(width), "same")
     return size * x[:samples] / np.std(x)
 
 
 def moving_base(u: np.ndarray, a: np.ndarray, friction: float = 0.0) -> np.ndarray:
-    """A flexible joint on a base that turns with the acceleration `a`, in angles against the ground.
+    """Outputs of a flexible joint on a base that turns with the acceleration `a`, by scipy's integrator.
 
-    Written in other coordinates than the package's: `phi` of the hub and `psi` of the arm are absolute, the
-    base turns by `b`, and every torque between the parts depends on differences. Held inputs, scipy's
-    integrator.
+    The coordinates differ from those of the package: `phi` of the hub and `psi` of the arm are absolute, the
+    base turns by `b`, and torques between the parts depend on differences. Inputs are held over each sample.
     """
     Jh, Ja, k, d, dh, gain = 0.002, 0.006, 1.6, 0.004, 0.02, 0.05
     y, x = np.zeros((len(u), 2)), np.zeros(6)  # phi, psi, b and their speeds
@@ -68,7 +67,7 @@ def moving_base(u: np.ndarray, a: np.ndarray, friction: float = 0.0) -> np.ndarr
 
 
 def joint(*effects: object) -> Mechanism:
-    """The joint of `moving_base`, standing still."""
+    """The joint of `moving_base` with the base at rest."""
     motor = rf.effects.Motor(at="hub", torque_constant=0.05, back_emf=0.0, resistance=1.0, gear_ratio=1.0)
     plain = rf.joints.flexible_joint(
         hub_inertia=0.002,
@@ -98,7 +97,7 @@ def test_a_joint_on_a_moving_base_is_one_with_a_disturbance_at_each_inertia():
     "solver", [Exponential(), Exponential(order=4), Exponential(substeps=3), SmoothRK4(substeps=4)]
 )
 def test_every_rule_holds_the_signal_as_it_holds_the_input(solver):
-    """A matrix exponential with two inputs says the same of a linear machine."""
+    """Reference for a linear machine: scipy's zero-order hold with two inputs."""
     m = joint(MeasuredDisturbance(at=f"joint: {OTHER}", gain=0.3))
     M, D, K = np.array([[0.008, 0.006], [0.006, 0.006]]), np.diag([0.02, 0.004]), np.diag([0.0, 1.6])
     inverse, zero, one = np.linalg.inv(M), np.zeros((2, 2)), np.eye(2)
@@ -113,7 +112,7 @@ def test_every_rule_holds_the_signal_as_it_holds_the_input(solver):
 
 
 def test_friction_holds_against_a_signal():
-    """Below the level of friction the hub rests, however the torque of the signal varies; above it moves."""
+    """The hub rests while the torque of the signal is below the level of friction, and moves above it."""
     m = joint(MeasuredDisturbance(at=f"hub: {OTHER}", gain=1.0), Coulomb(at="hub", level=0.05))
     w = np.zeros((500, 2))
     w[:, 1] = 0.049 * np.sin(np.arange(500) / 20)
@@ -191,7 +190,7 @@ def spun_base(N: int = 100, seed: int = 15) -> Recording:
 
 @pytest.fixture(scope="module")
 def measured() -> Recording:
-    """6 s of it."""
+    """A recording of 6 s on the moving base."""
     return spun_base(1500, 11)
 
 
@@ -226,7 +225,7 @@ CANDIDATES = [
 
 
 def test_a_search_names_the_signal_that_acts_and_no_other_one(measured):
-    """The moving base is named where its acceleration is the signal; a signal of something else is not."""
+    """The moving base is found if it acts; the same signal is not added to data of a base at rest."""
     model = joint(Coulomb(at="hub", level=0.01)).trust("arm.inertia.inertia")
     train, validation = measured.split(0.6)
     found = rf.discover(model, train, validation, candidates=CANDIDATES, rounds=1)
@@ -255,7 +254,7 @@ def test_recordings_with_a_say_decide_which_signals_are_tried(measured):
 
 
 def test_other_inputs_of_a_machine_with_signals_leave_these_as_they_are():
-    """What would help is sought among inputs; a signal is what it is."""
+    """Other inputs are tried; signals keep their values."""
     model = rf.Model(joint(*on_moving_base()))
     short = spun_base(60)
     quiet = dataclasses.replace(short, u=1e-2 * short.u)
@@ -302,7 +301,7 @@ def test_a_signal_goes_with_the_last_effect_that_takes_it():
 
 
 def test_a_fit_does_not_take_a_signal_for_a_wrong_sign():
-    """What the base does outweighs the input and runs against it."""
+    """The torque of the base is larger than that of the input and has the opposite sign."""
     u = coloured(1500, 0.2, 11, 300)
     w = np.column_stack([u, 50 * u])
     model = joint(*on_moving_base())
@@ -312,7 +311,7 @@ def test_a_fit_does_not_take_a_signal_for_a_wrong_sign():
 
 
 def test_stages_of_the_serial_link_in_one():
-    """Link 2 alone on a link 1 that is held: the joint of stage 2; and both links respond to each other."""
+    """With link 1 fixed, link 2 is the joint of stage 2; otherwise the links move each other."""
     both = rf.joints.two_stage_link()
     assert both.signals == (OTHER,)
     held = both.with_values({"joint1.spring.stiffness": 1e7, "hub1.inertia.inertia": 1e4})

@@ -1,4 +1,4 @@
-"""Evidence of an input against explicit least squares, SciPy, differences, and the independent simulator."""
+"""Evidence of an input against least squares, scipy, finite differences and an independent simulator."""
 
 import dataclasses
 
@@ -50,7 +50,7 @@ def problem():
 
 
 def test_nats_of_a_linear_rival_are_the_noncentrality_of_least_squares():
-    """A free inertia under a delayed voltage, explained by first state, offset and bias alone."""
+    """A free inertia with a delayed voltage, fitted by first state, offset and bias alone."""
     m = rf.Mechanism(
         coordinates=("x",),
         ports={"hub": (1.0,)},
@@ -109,7 +109,7 @@ def test_a_model_reproduces_its_own_run(problem):
 
 
 def test_with_process_noise_an_innovation_is_weaker_evidence():
-    """A predictor corrects slow errors: the same difference is no more evidence than in a free run."""
+    """A predictor corrects slow errors, so the same difference is weaker evidence than in a free run."""
     u = noise(600, Ts, bandwidth=10.0, seed=2)
     free = pair()
     y = free_run_from_rest(free[0], u, Ts)
@@ -136,7 +136,7 @@ def test_the_gradient_is_that_of_differences(problem):
 
 
 def test_the_gradient_of_a_peak(problem):
-    """With a penalty the logarithm of a peak comes off, to the width of the smooth maximum."""
+    """A penalty subtracts the gradient of the logarithm of a peak, which is a smooth maximum."""
     u = multisine(500, Ts, band=(0.5, 15.0), rms=0.8)
     m = problem.evaluate(u)
     penalty = np.array([[0.0, 1.0], [0.0, 0.0]])
@@ -154,7 +154,7 @@ def test_limits_on_voltage_and_slew_hold_exactly_and_change_nothing_needlessly()
     smooth = np.sin(2 * np.pi * np.arange(800) * Ts)
     smooth *= np.minimum(1, np.minimum(np.arange(1, 801), np.arange(800, 0, -1)) / 20)
     np.testing.assert_allclose(limits.playable(smooth, Ts), smooth, atol=1e-12)
-    # Below a jump the largest slow signal rises after it, above it the smallest one before.
+    # The largest admissible signal below a jump rises after it, the smallest one above rises before it.
     k, most = np.arange(200), 150.0 * Ts
     jump = np.where(k < 100, -1.0, 1.0) * (np.minimum(k, 199 - k) >= 20)
     below = np.where(k < 100, -1.0, np.minimum(1.0, -1.0 + most * (k - 99)))
@@ -164,14 +164,14 @@ def test_limits_on_voltage_and_slew_hold_exactly_and_change_nothing_needlessly()
 
 @pytest.mark.parametrize("before", [-1.0, -0.4, 0.0, 1.0])
 def test_one_input_follows_another_within_the_slew(before):
-    """Whatever it was before, up to the step from which 0 V is one step away, also at a reduced level."""
+    """The first sample follows any voltage that is within one step of 0 V, also at a reduced level."""
     limits, rng = Limits(voltage=2.0, slew=150.0), np.random.default_rng(7)
     start = before * 150.0 * Ts
     u = limits.playable(4 * rng.standard_normal(60), Ts, start)
     for level in (1.0, 0.4, 0.06):
         assert np.max(np.abs(np.diff(level * u, prepend=start, append=0.0))) <= 150.0 * Ts * (1 + 1e-9)
     np.testing.assert_allclose(limits.playable(u, Ts, start), u, atol=1e-12)
-    # Away from its beginning it is the input that follows 0 V.
+    # Away from its beginning it equals the input that follows 0 V.
     other = limits.playable(4 * np.random.default_rng(7).standard_normal(60), Ts)
     np.testing.assert_allclose(u[10:], other[10:], atol=1e-12)
 
@@ -191,7 +191,7 @@ def test_each_sample_follows_the_two_it_is_said_to_follow():
 
 
 def test_input_optimisation_gains_within_the_limits():
-    """Where the deflection binds, a design beats the input it starts from, itself as large as allowed."""
+    """With an active limit of the deflection, the design beats its start, both as large as allowed."""
     c = DiscriminationProblem(pair(Ts=0.005), 0.005, Limits(voltage=6.0, travel=1.0, deflection=0.12))
     start = c.scaled_to_limits(prbs(300, 0.005, amplitude=6.0, hold=0.02))
     before = c.evaluate(c.scaled_to_limits(np.tile(start, 2))).nats
@@ -202,7 +202,7 @@ def test_input_optimisation_gains_within_the_limits():
 
 
 def test_the_expected_evidence_is_found_on_the_independent_simulator():
-    """Log-likelihood of the truth less that of its rival, averaged over sensor noise."""
+    """It is the log-likelihood of the truth less that of its rival, averaged over sensor noise."""
     h = 0.002
     a, b = pair(0.0021, h)
     u = prbs(2500, h, amplitude=1.5, hold=0.02, seed=4)
@@ -212,7 +212,7 @@ def test_the_expected_evidence_is_found_on_the_independent_simulator():
         y = make_record({DELAY: {"time": 0.0021}}, seed=seed, perturb=0.0, played=u)["y"]
         cost = [fit_rival(x, u, y, h).nats for x in (a, b)]
         got.append(cost[1] - cost[0])
-    # The margin of one record has the variance 2 T about T.
+    # The difference of one recording has mean T and variance 2 T.
     spread = np.sqrt(2 * expected / len(got))
     assert expected > 40
     assert abs(np.mean(got) - expected) < 3 * spread + 0.15 * expected

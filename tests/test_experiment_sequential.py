@@ -1,4 +1,4 @@
-"""Experiments that stop by themselves: Gaussian integrals, Wald's bound, the independent simulator."""
+"""Sequential experiments against Gaussian integrals, Wald's bound and an independent simulator."""
 
 import dataclasses
 import json
@@ -23,7 +23,7 @@ MOTOR = fx.Motor(at="hub")
 
 
 def servo(damping: float = 0.01) -> rf.Mechanism:
-    """A servo with one inertia, whose damping alone is not known."""
+    """A servo with one inertia, of which only the damping is free."""
     m = rf.Mechanism(
         coordinates=("x",),
         ports={"hub": (1.0,)},
@@ -39,7 +39,7 @@ def known(damping: float) -> rf.Mechanism:
 
 @pytest.fixture(scope="module")
 def pair() -> SequentialExperiment:
-    """Two servos that differ in a known damping, and the segment that is played on them."""
+    """An experiment on two servos that differ in a known damping, with its first segment planned."""
     limits = rf.Limits(voltage=1.2)
     settings = {"noise": NOISE, "segment_seconds": 0.4, "error": 0.1, "improve": False}
     models = {"light": known(0.01), "heavy": known(0.02)}
@@ -47,7 +47,7 @@ def pair() -> SequentialExperiment:
 
 
 def linear_runs(damping: float, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Positions, and their slopes along offset [V], first position and speed, by matrix exponentials."""
+    """Positions, and derivatives by offset [V], first position and first speed, by matrix exponentials."""
     stamp = MOTOR.stamp()
     big = np.zeros((3, 3))
     big[0, 1], big[1, 1], big[1, 2] = 1.0, -(damping + stamp.damping) / 0.02, stamp.drive / 0.02
@@ -82,7 +82,7 @@ def test_probabilities_are_those_of_gaussian_integrals(pair):
 
 
 def test_a_wrong_answer_is_no_more_probable_than_was_asked_for(pair):
-    """Wald's bound over repetitions: one of two linear models is drawn, the noise is known."""
+    """Wald's bound over 60 repetitions with known noise; the two linear models are true in turn."""
     rng, wrong, decided, repetitions = np.random.default_rng(11), 0, 0, 60
     for k in range(repetitions):
         true, e, u = k % 2, pair, np.zeros(0)
@@ -99,7 +99,7 @@ def test_a_wrong_answer_is_no_more_probable_than_was_asked_for(pair):
 
 
 def test_expected_evidence_is_found_on_average(pair):
-    """The log-odds after a segment have the mean that was expected, over the noise."""
+    """The log-odds after a segment have the expected mean over sensor noise."""
     choice = SegmentChoice(pair)
     T, _ = choice.evidence(pair.planned.u[None], (1.0,), drawn=False)
     clean, got = linear_runs(0.02, pair.planned.u)[0], []
@@ -129,13 +129,13 @@ def test_the_first_part_of_an_input_counts_as_a_shorter_one():
 def test_seconds_until_it_is_decided_by_hand(pair):
     """At 10 % and equal probabilities log 9 nats are needed."""
     choice, need = SegmentChoice(pair), np.log(9.0)
-    # After half a segment, one and four: the first model reaches what it needs at 3/4, the other at 10.
+    # Evidence after 0.5, 1 and 4 segments: the first model reaches `need` after 0.75, the other after 10.
     T = np.zeros((3, 1, 2, 2))
     T[:, 0, 0, 1] = [0.5 * need, 1.5 * need, 6 * need]
     T[:, 0, 1, 0] = [-need, 0.1 * need, 0.4 * need]
     got = choice.seconds_until_decided(T, (0.5, 1.0, 4.0))
     assert got == pytest.approx([0.4 * (0.75 + 10) / 2])
-    # Nobody sees a decision before the first evaluation.
+    # There is no decision before the first evaluation.
     T[:] = 9 * need
     assert choice.seconds_until_decided(T, (0.5, 1.0, 4.0)) == pytest.approx([0.2])
 
@@ -154,7 +154,7 @@ def test_a_segment_in_pieces_ends_where_it_is_decided(tmp_path):
         return e
 
     whole, pieces = ran(None, 1e-9), ran(0.25, 1e-9, stops=True)
-    # Two segments of 0.25, 0.25 and 0.1 s are recorded as those in one piece, whatever their inputs are.
+    # Two segments in pieces of 0.25, 0.25 and 0.1 s are recorded like whole ones; inputs may differ.
     assert [len(r.u) for r in pieces.runs] == [len(r.u) for r in whole.runs] == [120]
     assert len(pieces.history) == len(whole.history) == 2
     assert pieces.history[1].seconds == pytest.approx(1.2)
@@ -167,7 +167,7 @@ def test_a_segment_in_pieces_ends_where_it_is_decided(tmp_path):
 
 
 def test_a_lag_is_not_taken_for_a_delay_that_its_model_has_approximated():
-    """Voltages that change at every sample, on the independent simulator: the model of a lag fits it."""
+    """The model of a lag fits a run of the independent simulator with a new voltage at every sample."""
     truth, h = {("lag", "input"): {"time": 5e-4}}, 0.002
     u = 6.0 * np.sign(np.sin(2 * np.pi * 60 * h * np.arange(1000) + 0.3))
     r = make_record(truth, seed=2101, played=u, fs=1 / h)
@@ -201,7 +201,7 @@ def friction_rivals() -> dict[str, rf.Mechanism]:
 
 @pytest.fixture(scope="module")
 def three() -> tuple[rf.SequentialResult, list[np.ndarray]]:
-    """Three rivals of which the second is true, on a rig that is given as a function."""
+    """An experiment with three rivals, of which the second is true, on a rig given as a function."""
     machine = rf.SimulatedRig(servo(0.011) + fx.Coulomb(at="hub", level=0.003), LIMITS, TS, NOISE, seed=4)
     played: list[np.ndarray] = []
 
@@ -247,7 +247,7 @@ def test_the_slope_of_an_inputs_worth_is_that_of_differences():
     choice, rng = SegmentChoice(e), np.random.default_rng(0)
     t = TS * np.arange(60)
     x = 0.5 * np.sin(2 * np.pi * 2 * t)[None] + 0.02 * rng.standard_normal((1, 60))
-    # The shifted rival is simulated, the objective has it to first order: small differences, small shifts.
+    # The shifted rival is simulated, but is of first order in the objective: differences must be small.
     _, g = choice._value_and_slope(x, 1.0)
     for _ in range(3):
         way = rng.standard_normal((1, 60)) + g / np.abs(g).max()
@@ -311,7 +311,7 @@ def test_other_parameters_compile_nothing(pair):
 
 @pytest.mark.slow
 def test_on_the_independent_simulator_the_true_effect_is_found_within_the_limits():
-    """A delay that is fitted as a delay or as a lag, on a rig with true sticking and 20 us steps."""
+    """Rivals are a fitted delay and a fitted lag; the rig has a delay, sticking friction and 20 us steps."""
     limits = rf.Limits(voltage=6.0, travel=np.deg2rad(90), deflection=np.deg2rad(10))
     truth, h = {("delay", "input"): {"time": 0.0021}}, 0.005
     r = make_record(truth, seed=5, seconds=4.0, fs=1 / h)

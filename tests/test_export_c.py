@@ -1,4 +1,4 @@
-"""The C code of a model does what the simulator does, for every effect and every rule of the step."""
+"""C code of a model gives the outputs of the simulator, for every effect and rule of integration."""
 
 import ctypes
 import dataclasses
@@ -56,7 +56,7 @@ class MagneticBrake(Force):
 
 @dataclasses.dataclass(frozen=True)
 class LateMean(Actuation):
-    """A user's own rule on the sequence: the mean of the last three commands, zero before the first."""
+    """A user's own effect on the input: the mean of the last three commands, zero before the first."""
 
     name: ClassVar[str] = "late_mean"
     title: ClassVar[str] = "moving mean"
@@ -91,7 +91,7 @@ class Iterates(Force):
 
 
 def command() -> np.ndarray:
-    """Ten seconds: fast, slow, at rest, beyond every limit."""
+    """Ten seconds of input: slow, fast, constant, and beyond the 5 V of `Saturation`."""
     rng = np.random.default_rng(3)
     t = Ts * np.arange(N)
     u = 3 * np.sin(3.1 * t) + 2 * np.sin(19 * t + 1) + 0.5 * rng.normal(size=N)
@@ -100,7 +100,7 @@ def command() -> np.ndarray:
 
 
 def sized(cls, at: str):
-    """An effect that acts: no amplitude at zero."""
+    """An effect without an amplitude at zero, so that it acts."""
     other = {
         n: s.typical for n, s in cls.declared().items() if n in cls.amplitudes and not getattr(cls, n, None)
     }
@@ -108,10 +108,10 @@ def sized(cls, at: str):
 
 
 def models() -> dict[str, Model]:
-    """Every effect of the catalogue, some at a time, and every rule of the step."""
+    """Models with every effect of the catalogue, several at a time, and with every rule of integration."""
     start = paper(hub_damping=0.01, inductance=2e-4)
     present = {"inertia", "spring", "motor", "viscous"}
-    # A machine has one gear; a disturbance has the phase or the signal of its recording, which no code has.
+    # A machine has one gear. Disturbances need the phase or the signal of a recording, which C code lacks.
     loop, disturbances = (
         {"pid_servo", "current_meter", "duty_meter"},
         {"periodic_disturbance", "measured_disturbance"},
@@ -152,7 +152,7 @@ def models() -> dict[str, Model]:
 
 @pytest.fixture(scope="module")
 def source():
-    """All models as C code, each with a function that is called from elsewhere."""
+    """All models as C code, each with a function that this test calls."""
     text = []
     for k, model in enumerate(models().values()):
         C = len(model.mechanism.channels)
@@ -167,7 +167,7 @@ def source():
 
 @pytest.fixture(scope="module")
 def library(source, tmp_path_factory):
-    """All models, compiled together with every warning an error."""
+    """All models, compiled with warnings as errors."""
     folder = tmp_path_factory.mktemp("c")
     (folder / "all.c").write_text(source)
     flags = ["-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror", "-O1", "-shared", "-fPIC"]
@@ -200,7 +200,7 @@ ALLOCATIONS = {"malloc", "calloc", "realloc", "free", "alloca", "aligned_alloc"}
 
 
 def cross_compiler() -> tuple[list[str], str]:
-    """A compiler for a processor of 32 bits, GNU's or that of the package ziglang, and what lists names."""
+    """A 32-bit compiler, of GNU or of the package ziglang, and a program that lists symbols."""
     if arm := shutil.which("arm-none-eabi-gcc"):
         return [arm, "-mcpu=cortex-m4", "-mthumb"], "arm-none-eabi-nm"
     if importlib.util.find_spec("ziglang") and (nm := shutil.which("nm")):
@@ -209,7 +209,7 @@ def cross_compiler() -> tuple[list[str], str]:
 
 
 def undefined_names(source: str, compiler: list[str], nm: str, folder) -> set[str]:
-    """What the object code of all models takes from elsewhere."""
+    """Undefined symbols in the object code of all models."""
     (folder / "all.c").write_text(source)
     strict = ["-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror", "-Os", "-c", "all.c", "-o", "all.o"]
     subprocess.run([*compiler, *strict], cwd=folder, check=True)

@@ -1,4 +1,4 @@
-"""State space and equations of a model, against what other libraries make of them."""
+"""State space and equations of a model against closed forms and other libraries."""
 
 import re
 
@@ -34,9 +34,9 @@ JOINT = {
 
 
 def by_hand() -> tuple[np.ndarray, np.ndarray]:
-    """The textbook's equations, solved for the accelerations with pencil and paper."""
+    """The textbook's equations, solved for the accelerations by hand."""
     Jh, Ja, K, Bh, Bj = JOINT.values()
-    k = 0.00767 * 70 / 2.6  # torque per volt, and per 0.00767 * 70 rad/s
+    k = 0.00767 * 70 / 2.6  # torque per volt [N m/V]
     D = k * 0.00767 * 70 + Bh
     A = np.zeros((4, 4))
     A[0, 2] = A[1, 3] = 1.0
@@ -63,7 +63,7 @@ def test_small_motion_about_an_operating_point_is_that_of_the_simulator():
     Ts, N = 0.001, 400
     m = paper(**JOINT) + CubicSpring("joint", stiffness=40.0) + Gravity("arm", sine=0.3, cosine=0.1)
     m = m + SecondMode("arm", inertia=1e-3) + SensorGain("alpha", error=0.05)
-    # Let it come to rest under a constant voltage: there is the operating point.
+    # The operating point is the state of rest with a constant voltage.
     rest = simulate_states(m, np.full(20_000, 0.4), Ts)[-1]
     assert abs(rest[1]) > 0.02 and np.abs(rest[2:4]).max() < 1e-6
     linear = state_space(Model(m), Ts, positions=rest[:2], speeds=rest[2:4], voltage=0.4)
@@ -74,7 +74,7 @@ def test_small_motion_about_an_operating_point_is_that_of_the_simulator():
     assert np.abs(truth[:, 1]).max() > 1e-6
     np.testing.assert_allclose(truth, expected, atol=2e-4 * np.abs(truth).max())
     away = state_space(Model(m), Ts)
-    assert np.abs(away.A - linear.A).max() > 1e-3  # the point matters
+    assert np.abs(away.A - linear.A).max() > 1e-3  # the matrix depends on the point
 
 
 def test_memory_has_its_slope_and_friction_is_named():
@@ -121,13 +121,13 @@ def test_refuses_a_point_of_another_size():
 
 @pytest.mark.parametrize("name", sorted(CATALOG))
 def test_every_law_is_good_latex(name):
-    """Another program's reader of LaTeX mathematics takes it, and every name of the effect is in it."""
+    """The parser of matplotlib accepts it, and it contains every parameter of the equation."""
     from matplotlib.mathtext import MathTextParser
 
     written = equation(CATALOG[name])
     size = MathTextParser("path").parse(f"${written}$")
     assert size.width > 20
-    # An equation may leave out a parameter only where its own text leaves it out.
+    # A parameter may be missing only if the text of the equation leaves it out too.
     for parameter in CATALOG[name].declared():
         if re.search(rf"\b{parameter}\b", CATALOG[name].equation):
             assert rf"\mathit{{{parameter.replace('_', chr(92) + ' ')}}}" in written

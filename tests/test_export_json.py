@@ -1,4 +1,4 @@
-"""A saved model is the model: every effect, every number, every setting."""
+"""A saved model is loaded without any change of effects, values and settings."""
 
 import dataclasses
 import json

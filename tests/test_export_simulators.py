@@ -1,4 +1,4 @@
-"""MuJoCo, a co-simulation master and BAM do with an exported model what the toolkit does, or it is said."""
+"""Exported models against MuJoCo, a co-simulation master and BAM; certificates name what is left out."""
 
 import io
 import json
@@ -48,7 +48,7 @@ from rotflex_jax.models.model import Model
 Ts = 0.002
 U = standard_input(Ts, 2.0)[:1500]  # 3 s: motion, then a rest
 NOISE = math.radians(360 / 4096) / math.sqrt(12)
-"""What an encoder of 4096 counts adds by rounding [rad]."""
+"""Standard deviation of the rounding of an encoder of 4096 counts [rad]."""
 
 JOINT = paper(hub_damping=0.01, joint_damping=0.003)
 cc = shutil.which("cc")
@@ -90,7 +90,7 @@ def certified(mechanism, u=U, **options):
 
 @pytest.mark.parametrize("name", SAID)
 def test_mujoco_does_what_the_toolkit_does(name):
-    """Within the noise of an encoder; a speed [rad/s] within what that noise is over 5 ms."""
+    """Differences are below the noise of an encoder; for a speed, below this noise divided by 5 ms."""
     certificate = certified(SAID[name]).certificate
     assert certificate.left_out == () == certificate.approximated and not certificate.not_simulated
     limits = [NOISE / (0.005 if unit == "rad/s" else 1.0) for unit in certificate.units]
@@ -117,7 +117,7 @@ def test_mujoco_has_an_axis_that_slides():
 
 
 def test_a_difference_shows_in_the_certificate():
-    """The comparison would not pass for another friction, inertia or gain."""
+    """With another friction or inertia in the file, the difference exceeds the noise."""
     text = certified(SAID["Coulomb"]).content
     own = simulate(SAID["Coulomb"], U, Ts)
     for old, new in (
@@ -154,7 +154,7 @@ def test_what_mujoco_cannot_say_is_named(effect, said, at_least):
 
 
 def test_order_on_the_voltage_counts():
-    """A limit behind a lag is another machine than one before it."""
+    """A limit after a lag is left out of the file; a limit before the lag is exported."""
     assert "saturation" in certified(JOINT + Lag() + Saturation(limit=1.0)).certificate.left_out[0]
     assert certified(JOINT + Saturation(limit=1.0) + Lag()).certificate.left_out == ()
 
@@ -246,7 +246,7 @@ SERVO = xl330_pendulum().with_values({"hub.position_servo.period": 0.0})
 
 
 def test_bam_takes_the_friction_of_a_gear_as_that_of_its_load():
-    """The same law under both names; which torque it follows in BAM is said."""
+    """Both effects give the same file; the certificate names the torque that it depends on in BAM."""
     one, other = (
         to_bam(SERVO + effect, 0.005, u=0.3 * U[::2])
         for effect in (
@@ -276,10 +276,10 @@ def test_bam_does_what_the_toolkit_does(effects, model, keys):
     always = {"kt", "R", "armature", "q_offset", "friction_base", "friction_viscous", "model", "actuator"}
     assert set(content) == always | keys and content["model"] == model and content["actuator"] == "xl330"
     assert content["q_offset"] == pytest.approx(math.atan2(0.02, 0.49 * 9.80665 * 0.1))
-    # The weight of the pendulum grows with its offset, and with it the inertia at its length.
+    # The cosine increases the weight of the pendulum, and with it the inertia at the same length.
     inertia = content["armature"] + math.hypot(0.02, 0.49 * 9.80665 * 0.1) * 0.1 / 9.80665
     assert inertia == pytest.approx(0.0069)
-    # The load of both sides of the gear differs from their mean while the pendulum accelerates.
+    # While the pendulum accelerates, the loads of both sides of the gear differ from their mean.
     assert exported.certificate.largest[0] < (5 if model == "m3" else 2) * NOISE, str(exported.certificate)
     assert [line for line in exported.certificate.left_out if "firmware" not in line] == []
 
@@ -363,7 +363,7 @@ def test_fmu_steps_by_whole_samples_only_and_goes_back_to_a_saved_state(fmu, tmp
         lambda: unit.doStep(3 * Ts, 0.7 * Ts),
         lambda: unit.doStep(9 * Ts, Ts),
         lambda: unit.setFloat64([1], [math.nan]),
-        lambda: unit.setFloat64([4], [0.1]),  # a first position, after the start
+        lambda: unit.setFloat64([4], [0.1]),  # a first position cannot be set after the start
         lambda: unit.getFloat64([99]),
     ):
         with pytest.raises(Exception, match=r"status 3 \(error\)"):

@@ -1,4 +1,4 @@
-"""What stopped or misled a newcomer with a file of an own drive: each stumble as a test, by both doors."""
+"""Errors of new users with files of their own machines, in Python and on the command line."""
 
 import dataclasses
 import json
@@ -57,7 +57,7 @@ def test_counts_are_named_as_counts_and_the_cure_works(run, tmp_path) -> None:  
     assert status == 0
     assert "0.0879" in out  # the step of the encoder [deg]
     assert run("check", file, "--counts-per-turn", COUNTS)[1] == out
-    # Degrees would scale the angles wrongly, and lead to a wrong answer far above the noise.
+    # Counts that are read as degrees would give wrong angles, and errors far above the noise.
     status, _, err = run("check", file, "--degrees")
     assert status == 2
     assert_one_sentence(err, "counts of an encoder", "--counts 4096")
@@ -90,7 +90,7 @@ def test_wrong_counts_are_refused_on_the_command_line(options, run, tmp_path) ->
     assert_one_sentence(err, "--counts theta=4096")
 
 
-# The arm's angle in the room, and swapped columns
+# The absolute angle of the arm, and swapped columns
 
 
 def test_the_arms_angle_in_the_room_is_refused_and_the_cure_works(run, tmp_path) -> None:  # noqa: F811
@@ -116,7 +116,7 @@ def test_swapped_channels_are_noticed_and_the_cure_works(run, tmp_path) -> None:
     assert np.allclose(found.y, RECORDING.y)
 
 
-# One column alone, under a name of one's own
+# One column alone, under another name
 
 
 def test_one_column_under_another_name_says_which_sensor_it_is(run, tmp_path) -> None:  # noqa: F811
@@ -207,7 +207,7 @@ def test_uneven_times_are_resampled_on_request(run, tmp_path) -> None:  # noqa: 
     # The error of a line between samples is at most an eighth of the second difference.
     bound = 0.25 * np.max(np.abs(np.diff(THETA, 2))) + 1e-12
     assert np.max(np.abs(found.y[inside, 0] - expected[inside])) < bound
-    assert set(found.u) <= set(U)  # held, and so never a value that was not given
+    assert set(found.u) <= set(U)  # the input is held, so that only given values occur
     assert [f.severity for f in found.findings if f.kind == "resampled"] == ["note"]
     assert "Resampled" in run("check", tmp_path / "run.csv", "--resample", "auto")[1]
 
@@ -314,7 +314,7 @@ def test_steps_of_integration_on_the_command_line(run, tmp_path) -> None:  # noq
         )
         saved = pd.read_csv(tmp_path / "saved.csv")
         assert np.allclose(saved["theta_simulated"], y_hat[:, 0], rtol=0, atol=1e-6)
-    # A fit in steps that are too long says so, and with what it advises it says so no more.
+    # A fit with too long steps has a remark; with the advised number of steps it has none.
     page = tmp_path / "page"
     status, out, _ = run("simulate", file, "--fit", other, "--add", "coulomb@hub", "--report", page)
     (note,) = [line for line in out.splitlines() if line.startswith("note: ")]
@@ -324,7 +324,7 @@ def test_steps_of_integration_on_the_command_line(run, tmp_path) -> None:  # noq
     assert "rf.Exponential(substeps=4)" in (page / "simulation.html").read_text()
     out = run("simulate", file, "--fit", other, "--add", "coulomb@hub", "--substeps", "4")[1]
     assert "note: " not in out
-    # So do a comparison and the design of an experiment of the models that they fit.
+    # A comparison and the design of an experiment have the same remark for the models that they fit.
     model = rf.joints.paper() + rf.effects.Coulomb(at="hub")
     later = make_record([("coulomb", "hub")], seed=4, seconds=4.0, fs=250.0)
     test = rf.Recording(u=later["u"], y=later["y"], Ts=later["Ts"])
@@ -383,7 +383,7 @@ def test_what_is_no_search_by_name_is_refused(line, said, run, measured) -> None
     assert_one_sentence(err, said)
 
 
-# Effects of one's own
+# Effects of a user
 
 
 @dataclasses.dataclass(frozen=True)
@@ -426,7 +426,7 @@ def test_a_wrong_probe_is_told_in_a_sentence(probes, said, monkeypatch) -> None:
     monkeypatch.setattr(Power, "given", probes)
     with pytest.raises(InputError, match=said):
         Power.probe_values(SCALE)
-    # The search asks by the same door.
+    # The search makes the same check.
     monkeypatch.setitem(CATALOG, Power.name, Power)
     scales = dict.fromkeys(("hub", "arm", "joint"), SCALE)
     with pytest.raises(InputError, match=said):

@@ -16,14 +16,14 @@ from rotflex_jax.metrics import rmse
 from rotflex_jax.models.model import Model
 from rotflex_jax.recording import Recording
 
-# Friction stops and starts within a sample; three steps in each keep that error below the noise.
+# Friction stops and starts within a sample; with three steps per sample the error of that is below the noise.
 SOLVER = Exponential(substeps=3)
 FRICTION = ("coulomb", "hub")
 NOISE = np.sqrt(JITTER**2 + COUNT**2 / 12)
 
 
 def record(seed: int, effects=(FRICTION,), seconds: float = 3.0):
-    """A recording and the true numbers by their full names."""
+    """A recording and the true parameters by their full names."""
     r = make_record(effects, seed=seed, seconds=seconds, fs=400.0, rms=1.5)
     p = r["truth"]["plant"]
     truth = {
@@ -38,7 +38,7 @@ def record(seed: int, effects=(FRICTION,), seconds: float = 3.0):
 
 
 def off(truth, seed: int = 0, friction: bool = True) -> Model:
-    """The true structure with numbers 30 to 50 % off."""
+    """The true structure with parameters that are wrong by 30 to 50 %."""
     rng = np.random.default_rng(seed)
     start = {
         name: value * (1 + rng.choice([-1, 1]) * rng.uniform(0.3, 0.5))
@@ -66,7 +66,7 @@ def test_the_truth_is_within_the_intervals(recovered):
         z = [(found[name].value - value) / found[name].std for name, value in truth.items()]
         assert np.abs(z).max() < 4, dict(zip(truth, z, strict=True))
         scores.append(z)
-    # Neither too sure nor too modest.
+    # Standard deviations are neither too small nor too large.
     assert 0.5 < np.sqrt(np.mean(np.square(scores))) < 1.8
 
 
@@ -80,7 +80,7 @@ def test_intervals_are_narrow_and_residuals_are_the_sensor_noise(recovered):
             assert high == pytest.approx(estimate.value + 1.96 * estimate.std)
             assert estimate.free and estimate.note == ""
         np.testing.assert_allclose(list(found.noise.values()), NOISE, rtol=0.08)
-        # By hand: two channels of Gaussian residuals.
+        # Negative log-likelihood of two channels of Gaussian residuals, in closed form.
         N = 1200
         by_hand = sum(N * (np.log(s) + 0.5 * np.log(2 * np.pi * np.e)) for s in found.noise.values())
         assert found.cost == pytest.approx(by_hand)
@@ -108,7 +108,7 @@ def test_the_covariance_is_that_of_the_intervals(recovered):
 
 
 def test_scipy_finds_the_same_optimum(recovered):
-    """The same residuals through `scipy.optimize.least_squares`, slopes by differences."""
+    """Reference: `scipy.optimize.least_squares` on the same residuals, with difference quotients."""
     found, rec, truth = recovered[1]
     joint, names = found.model.mechanism, list(truth)
     scale = np.array(list(found.noise.values()))
@@ -123,12 +123,15 @@ def test_scipy_finds_the_same_optimum(recovered):
     best = least_squares(residuals, start, diff_step=1e-6, xtol=1e-12, ftol=1e-12)
     for name, value in zip(names, best.x[:6] * sizes[:6], strict=True):
         assert abs(found[name].value - value) < 0.1 * found[name].std, name
-    # The deviations are those of the residuals, so their sum of squares is the number of them.
+    # Residuals are scaled by their standard deviations, so the sum of their squares is their number.
     assert 2 * best.cost == pytest.approx(2 * rec.N, abs=1.0)
 
 
 def test_the_free_run_of_the_fitted_model_has_the_residuals(recovered):
-    """Fitted first states are a little better than those read off the first samples."""
+    """A free run from the first samples has residuals below three times the noise.
+
+    First states that are fitted to the whole recording, as in the fit, are a little better.
+    """
     found, rec, _ = recovered[2]
     rms = np.sqrt(np.mean((found.model.simulate(rec) - rec.y) ** 2, axis=0))
     assert (rms < 3 * NOISE).all()
@@ -147,12 +150,12 @@ def test_more_freedom_is_never_worse_and_prediction_hides_less():
     wrong = fit(off(truth, 1, friction=False), rec)
     right = fit(off(truth, 1), rec)
     assert right.cost < wrong.cost - 100
-    # A predictor follows what the physics lacks, so its residuals are far smaller.
+    # A predictor is corrected by the measurements where physics is missing, so its residuals are smaller.
     noises = {"hub": 1e-4, "joint": 1e-6}
     follows = fit(off(truth, 1, friction=False), rec, process_noise=noises)
     assert follows.noise["theta"] < 0.5 * wrong.noise["theta"]
     assert follows.noise["alpha"] < wrong.noise["alpha"]
-    # Where friction is in no record, the larger model explains it as well as the smaller one.
+    # In a recording without friction, the larger model is about as likely as the smaller one.
     rec, truth = record(5, effects=())
     small = fit(off(truth, 5, friction=False), rec)
     large = fit(off(truth, 5), rec)
@@ -167,12 +170,12 @@ def test_the_predictor_recovers_the_truth_too():
     free_run = fit(off(truth, 2), rec)
     for name, value in truth.items():
         assert abs(found[name].value - value) < 4 * found[name].std, name
-        # It uses less of the data, and says so.
+        # Predictions use less of the information in the data, so standard deviations are larger.
         assert found[name].std > free_run[name].std
 
 
 def test_each_recording_has_an_offset_of_its_own():
-    """The same machine twice, with voltages of +0.15 and -0.05 V added: their mean is reported."""
+    """The same machine with voltage offsets of +0.15 and -0.05 V: the fit gives each, and their mean."""
     pairs = [
         make_record({("voltage_offset", "input"): {"offset": v}}, seed=6, seconds=1.5, fs=400.0)
         for v in (0.15, -0.05)
@@ -184,7 +187,7 @@ def test_each_recording_has_an_offset_of_its_own():
     assert own[name].value == pytest.approx(0.05, abs=4 * own[name].std)
     assert own[name].std < 0.01
     np.testing.assert_allclose(list(own.noise.values()), NOISE, rtol=0.08)
-    # Each recording's own value, and the model with it: the machine but for its offset is one.
+    # `local` has the offset of each recording, and `model_of` gives the model with it.
     assert list(own.local) == [name]
     for number, (rec, v, e) in enumerate(zip(recs, (0.15, -0.05), own.local[name], strict=True)):
         assert e.value == pytest.approx(v, abs=4 * e.std) and 0 < e.std < 0.01
@@ -193,20 +196,20 @@ def test_each_recording_has_an_offset_of_its_own():
         assert rmse(rec, own.model.simulate(rec))["theta"] > 3 * np.max(NOISE)
     mean = np.mean([e.value for e in own.local[name]])
     assert own[name].value == pytest.approx(mean, rel=1e-9)
-    # Two separate voltages have a mean that is surer than each.
+    # The mean of two separate estimates has a smaller standard deviation than the less certain one.
     k = own.free_names.index(name)
     assert own[name].std == pytest.approx(np.sqrt(own.covariance[k, k]), rel=1e-9)
     assert own[name].std < max(e.std for e in own.local[name])
     shared = fit(joint, recs)
     assert shared.cost > own.cost + 1000
-    # One at a time, each has its own.
+    # A fit to one recording alone finds its offset.
     for rec, v in zip(recs, (0.15, -0.05), strict=True):
         alone = fit(joint, rec)
         assert alone[name].value == pytest.approx(v, abs=4 * alone[name].std)
 
 
 def test_windows_begin_anew_but_a_recording_keeps_its_own_offset():
-    """Cut into thirds: as right as in one piece, and one offset for each recording, not for each third."""
+    """A fit to thirds of two recordings finds one offset for each recording, not one for each third."""
     pairs = [
         make_record({("voltage_offset", "input"): {"offset": v}}, seed=6, seconds=1.5, fs=400.0)
         for v in (0.15, -0.05)
@@ -222,7 +225,7 @@ def test_windows_begin_anew_but_a_recording_keeps_its_own_offset():
 
 
 def test_windows_give_the_numbers_with_which_short_free_runs_are_best():
-    """A model without the friction that the plant has: bent for windows, or bent for the whole."""
+    """Of a model without friction, a fit to windows has smaller errors over windows than one to the whole."""
     rec, truth = record(3)
     lacking = off(truth, 3, friction=False)
     cut, whole = fit(lacking, rec, window_seconds=0.5), fit(lacking, rec)
@@ -236,7 +239,11 @@ def test_windows_give_the_numbers_with_which_short_free_runs_are_best():
 
 @pytest.mark.parametrize("frequency", [8.0, 15.0, 20.0])
 def test_a_mode_is_found_from_a_fitted_joint_without_it(frequency):
-    """Short predictions say little of a mode: begun with them, the fit ends above 13 Hz, 240 nats worse."""
+    """The fit finds a mode at 10 Hz from a start at 8, 15 or 20 Hz.
+
+    Short predictions contain little information about a mode: a fit that begins with them ends above 13 Hz,
+    240 nats worse.
+    """
     mode = ("second_mode", "arm")
     r = make_record({mode: {"inertia": 2e-4, "frequency": 10.0, "damping": 0.03}}, seed=7, seconds=20.0)
     rec = Recording(u=r["u"], y=r["y"], Ts=r["Ts"])
@@ -286,7 +293,7 @@ def test_asking_for_a_parameter_that_is_not_there(recovered):
 
 
 def test_one_inertia_by_hand():
-    """A servo in closed form: the speed answers exp(-t / T), the gain is 1 / back EMF."""
+    """Reference in closed form: the speed approaches its final value as exp(-t / T)."""
     joint = single_inertia(0.004, damping=0.01)
     gain = 0.00767 * 70 / 2.6
     rate = (0.01 + gain * 0.00767 * 70) / 0.004

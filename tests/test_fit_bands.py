@@ -1,4 +1,4 @@
-"""Bands of a free run: closed forms of each part, coverage on machines that nobody fitted, mixtures."""
+"""Bands of a free run: closed forms of each part, coverage on recordings that were not fitted, mixtures."""
 
 import dataclasses
 import functools
@@ -21,7 +21,7 @@ from rotflex_jax.fit.result import FitOptions
 
 N, TS, NOISE = 300, 0.01, 0.02
 CONSTANT = "hub.motor.torque_constant"
-NOISE_OF_ANGLES = 5e-4  # of the arena
+NOISE_OF_ANGLES = 5e-4  # standard deviation of the noise of the arena's angles [rad]
 
 
 def axis() -> rf.Mechanism:
@@ -50,7 +50,10 @@ def with_std(fit: Fit, share: float) -> Fit:
 
 
 def test_parts_are_those_of_a_linear_regression():
-    """theta_k = c g_k + position + speed t_k, position and speed by least squares from the first samples."""
+    """Reference: a linear regression in numpy.
+
+    theta_k = c g_k + position + speed t_k, with position and speed by least squares on the first samples.
+    """
     rec = recording(2)
     bands = rf.prediction_bands(with_std(fitted(), 0.1), rec, 0.9)
     head, t = slice(0, rec.n_init), TS * np.arange(N)
@@ -62,7 +65,7 @@ def test_parts_are_those_of_a_linear_regression():
     covariance = fit @ fit.T * sensor**2
     first = np.sqrt(np.einsum("ns,st,nt->n", X, covariance, X))
     np.testing.assert_allclose(bands.parts["first state"][:, 0], first, rtol=1e-6)
-    # What the torque constant adds, the first state takes away again where it is fitted to the same samples.
+    # The first state follows the torque constant, since it is fitted to samples that depend on it.
     whole = g - X @ (fit @ g[head])
     std = 0.1 * fitted()[CONSTANT].value
     np.testing.assert_allclose(bands.parts["parameters"][:, 0], std * np.abs(whole), rtol=1e-6, atol=1e-12)
@@ -79,7 +82,7 @@ def test_a_speed_that_is_hardly_known_widens_the_band_with_time():
 
 
 def test_what_each_recording_has_for_itself_widens_the_band():
-    """Runs of the same machine with torque constants that scatter by a tenth."""
+    """Of a local parameter that scatters by a tenth between runs, the scatter is a part of the band."""
     runs = []
     for k, factor in enumerate((0.9, 1.0, 1.1)):
         m = axis().with_values({CONSTANT: 0.01 * factor})
@@ -105,7 +108,7 @@ def test_process_torques_integrate_twice():
 
 
 def test_known_recordings_say_what_the_model_lacks():
-    """A band that is so wide that known runs lie in it as often as they should."""
+    """With a known recording, the band of a wrong model contains as many of its samples as it should."""
     wrong = dataclasses.replace(
         fitted(), model=rf.Model(fitted().model.mechanism.with_values({CONSTANT: 0.05}))
     )
@@ -119,7 +122,7 @@ def test_known_recordings_say_what_the_model_lacks():
 
 
 def test_bands_of_several_models_are_those_of_the_mixture():
-    """Between the models lies the weighted mean; each end cuts off half of what is outside."""
+    """The middle is the weighted mean of the runs, the ends are the 5 % and 95 % quantiles of the mixture."""
     rec, one = recording(7), with_std(fitted(), 1e-6)
     other = dataclasses.replace(one, model=rf.Model(one.model.mechanism.with_values({CONSTANT: 0.02})))
     alone = [rf.prediction_bands(f, rec) for f in (one, other)]
@@ -138,7 +141,7 @@ def test_bands_of_several_models_are_those_of_the_mixture():
 
 
 def test_bands_of_a_search_are_those_of_its_probable_sets():
-    """Each set fitted to the training recording, with its probability; an improbable one is left out."""
+    """Each set is fitted to the training data and weighted by its probability; one of 1 % is left out."""
     train, rec = recording(1), recording(9)
     shares = {frozenset(): 0.7, frozenset({"viscous@hub"}): 0.2, frozenset({"coulomb@hub"}): 0.01}
     found = Probabilities(tuple(SetProbability(s, p) for s, p in shares.items()), {}, 0.09)
@@ -158,10 +161,12 @@ def test_bands_of_a_search_are_those_of_its_probable_sets():
 
 
 def test_bands_hold_what_another_run_of_the_arena_measures():
-    """Friction as it is, fitted to the first half; nine of ten samples of the other half lie in the bands.
+    """With the true friction law fitted to the first half, 90 % bands contain 86 to 94 % of the second half.
 
-    That half begins in motion, where a friction with memory is not at rest: a run that takes it to be is off
-    by more than the noise until its end, and a band that allows for that holds everything.
+    The second half begins in motion, where a friction with memory is not at rest. A run that assumes rest is
+    off by more than twice the noise on average; the middle of the band, whose first state includes the
+    memory, by less than half the noise. A band that allowed for the error of the former would contain all
+    samples.
     """
     inside = {"theta": [], "alpha": []}
     for seed, effect in ((100, rf.effects.Coulomb("hub")), (100, rf.effects.BoucWen("hub"))):
@@ -201,7 +206,7 @@ def test_what_makes_no_sense_is_refused():
 
 
 def test_a_run_that_diverges_has_no_bands():
-    """Neither over the recording nor over one that is known: the width would be no number."""
+    """A run that diverges over the recording or over a known recording is refused."""
     calm = recording(8)
     huge = rf.Recording(u=1e307 * calm.u / np.abs(calm.u).max(), y=calm.y, Ts=TS, channels=("theta",))
     strong = {"hub.motor.gear_ratio": 1e4}
@@ -214,7 +219,7 @@ def test_a_run_that_diverges_has_no_bands():
 
 
 def test_a_run_whose_slopes_grow_without_limit_has_no_bands():
-    """Negative damping that friction does not hold; neither the run nor its slopes are infinite."""
+    """Negative damping that exceeds the friction is refused, although the run and its slopes are finite."""
     calm = recording(8)
     m = axis() + rf.effects.Viscous("hub") + rf.effects.Dahl("hub", level=0.5, presliding=0.02)
     held, loose = (rf.Model(m.with_values({"hub.viscous.coefficient": d})) for d in (-0.1, -0.3))
@@ -226,7 +231,7 @@ def test_a_run_whose_slopes_grow_without_limit_has_no_bands():
 
 
 def test_bristles_that_swing_within_a_sample_are_named_where_slopes_grow():
-    """Of 1000 N m/rad against 0.01 kg m^2: 316 rad/s, 3.2 rad a sample, and 0.1 rad in samples of 0.3 ms."""
+    """Bristles of 1000 N m/rad on 0.01 kg m^2: 316 rad/s, or 3.2 rad per 10 ms and 0.1 rad per 0.3 ms."""
     stiff = axis() + rf.effects.Viscous("hub") + rf.effects.Dahl("hub", level=0.1, presliding=1e-4)
     fit = dataclasses.replace(with_std(fitted(), 0.1), model=rf.Model(stiff))
     with pytest.raises(rf.InputError, match="the Dahl friction at the hub swings within a sample"):

@@ -1,4 +1,4 @@
-"""Fits whose steps of integration are too long say so, by how much, and what to do."""
+"""Remark of a fit on integration steps that are too long: shift of the estimates, and what to do."""
 
 import dataclasses
 import importlib
@@ -23,13 +23,13 @@ greybox = importlib.import_module("rotflex_jax.fit.greybox")
 
 
 def recorded(effects, fs: float = 400.0, seed: int = 3, seconds: float = 8.0) -> rf.Recording:
-    """What the independent simulator gives, which integrates in 20 us and sticks."""
+    """A recording of the independent simulator, which integrates in steps of 20 us with exact sticking."""
     r = make_record(effects, seed=seed, seconds=seconds, fs=fs)
     return rf.Recording(u=r["u"], y=r["y"], Ts=r["Ts"])
 
 
 def said(found: Fit) -> list[tuple[str, float, float]]:
-    """Parameter, standard deviations and nats of each remark on the step."""
+    """Parameter, shift in standard deviations and decrease of the cost [nat] of each remark on the step."""
     number = r"(-?[\d.]+)"
     pattern = rf"(\S+) would move by {number} of its .* the cost would fall by {number} nats"
     sentences = [r.sentence for r in found.remarks if r.kind == COARSE_STEP]
@@ -42,7 +42,7 @@ def largest_move(a: Fit, b: Fit) -> tuple[str, float]:
     for name, estimates in a.local.items():
         pairs = zip(estimates, b.local[name], strict=True)
         moved[name] = max(abs(q.value - p.value) / p.std for p, q in pairs)
-    moved = {n: size for n, size in moved.items() if np.isfinite(size)}  # without what a bound holds
+    moved = {n: size for n, size in moved.items() if np.isfinite(size)}  # without parameters at a bound
     name = max(moved, key=moved.__getitem__)
     return name, moved[name]
 
@@ -61,7 +61,7 @@ def test_a_remark_says_how_far_a_fit_in_finer_steps_moves(coarse) -> None:
     assert name == most and moved > 2
     assert deviations == pytest.approx(moved, rel=0.1)
     assert nats == pytest.approx(found.cost - finer.cost, abs=2)
-    assert not said(finer)  # of what it advises
+    assert not said(finer)  # with the advised steps
 
 
 def test_what_it_advises_is_nearer_to_the_truth() -> None:
@@ -107,7 +107,7 @@ def test_data_that_were_simulated_in_the_steps_of_the_fit_get_no_remark() -> Non
     recording = dataclasses.replace(given, y=y)
     found, finer = rf.fit(model, recording), rf.fit(rf.Model(model.mechanism, FINE), recording)
     assert not said(found)
-    # Shorter steps would move the estimates there as well, for the worse.
+    # Shorter steps move the estimates here as well, but the recording is less likely with them.
     assert largest_move(found, finer)[1] > 2 and finer.cost > found.cost + 10
 
 
@@ -120,7 +120,7 @@ def test_exact_steps_are_not_checked_by_a_run(monkeypatch) -> None:
 
 
 def test_other_values_and_recordings_of_the_same_length_share_the_program(coarse) -> None:
-    # With the memory full of programs of other tests, a new one would take the place of an old one.
+    # If the memory were full of programs of other tests, a new program would replace an old one.
     release_programs()
     rf.fit(rf.joints.paper() + COULOMB, coarse[0])
     made = len(runs)
@@ -128,7 +128,7 @@ def test_other_values_and_recordings_of_the_same_length_share_the_program(coarse
     assert said(rf.fit(rf.joints.paper(stiffness=1.5) + fx.Coulomb(at="hub", level=0.04), other))
     assert len(runs) == made
     rf.fit(rf.joints.paper() + COULOMB, recorded([("coulomb", "hub")], seconds=4.0))
-    assert len(runs) == made + 1  # another length has one, so the count works
+    assert len(runs) == made + 1  # another length has its own program, so the count works
 
 
 @pytest.mark.parametrize(
@@ -142,7 +142,7 @@ def test_other_values_and_recordings_of_the_same_length_share_the_program(coarse
     ids=["windows", "prediction", "local", "robust"],
 )
 def test_the_shift_is_that_of_the_fit_that_was_asked_for(asked) -> None:
-    # Both of one machine, which the seed draws.
+    # The seed determines the machine, so both recordings are of the same one.
     own = [recorded([("coulomb", "hub")], seed=4, seconds=s, fs=250.0) for s in (5.0, 4.0)]
     found = rf.fit(rf.joints.paper() + COULOMB + fx.VoltageOffset(at="input"), own, **asked)
     finer = rf.fit(rf.Model(found.model.mechanism, FINE), own, **asked)

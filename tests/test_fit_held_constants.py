@@ -1,4 +1,4 @@
-"""Intervals that depend on a trusted constant say so; constants of a motor that are one may be tied."""
+"""Trusted constants on which intervals depend are named; equal constants of a motor may be tied."""
 
 import json
 
@@ -18,7 +18,7 @@ RATIO, R = NUMBERS["hub.motor.gear_ratio"], NUMBERS["hub.motor.resistance"]
 
 
 def turned(constant: float, emf: float, damper: float) -> Recording:
-    """The paper's joint with other motor and damper, by the matrix exponential."""
+    """A recording of the paper's joint with another motor and damper, by the matrix exponential."""
     J, Ja, k = (NUMBERS[n] for n in ("hub.inertia.inertia", "arm.inertia.inertia", "joint.spring.stiffness"))
     gain = RATIO * constant / R
     M = np.linalg.inv([[J + Ja, Ja], [Ja, Ja]])
@@ -47,14 +47,14 @@ def untied(recording: Recording) -> rf.Fit:
 
 def test_a_damper_that_is_wrong_by_another_constant_says_on_which_it_hangs(untied: rf.Fit) -> None:
     found = untied[DAMPER]
-    assert found.ci95[0] > 1.5 * 0.0041  # tight, and wrong: the back-EMF is 5 % more than what is trusted
+    assert found.ci95[0] > 1.5 * 0.0041  # narrow and wrong: the true back-EMF is 5 % larger
     first = found.given[0]
     assert (first.name, first.value, first.unit) == (EMF, NUMBERS[EMF], "V s/rad")
     assert found.value + 5 * first.change == pytest.approx(0.0041, abs=4 * found.std)
     words = f"given {EMF} 0.00767 V s/rad"
     assert words in str(untied) and words in untied._repr_html_() and words in found.remark
     assert json.loads(json.dumps(found.to_dict()))["given"][0]["name"] == EMF
-    # It depends on the torque constant too, but that is free; a deflection's damper depends on no motor.
+    # It depends on the torque constant too, but that is free; the damper of the joint depends on no motor.
     assert K_T not in {c.name for e in untied.parameters for c in e.given}
     assert EMF not in {c.name for c in untied["joint.viscous.coefficient"].given}
 
@@ -70,9 +70,7 @@ def test_a_fit_with_another_constant_ends_where_the_words_say(
         if e.free:
             moved = again[e.name].value - e.value
             assert moved == pytest.approx(named.get(e.name, 0.0), rel=0.03, abs=0.3 * e.std)
-    assert again.cost == pytest.approx(
-        untied.cost, abs=0.01
-    )  # the recording does not tell one from the other
+    assert again.cost == pytest.approx(untied.cost, abs=0.01)  # the recording does not distinguish the two
 
 
 def test_tied_constants_are_fitted_as_one(untied: rf.Fit, recording: Recording, tmp_path) -> None:

@@ -1,4 +1,4 @@
-"""Fits of long free runs with models that lack something, bounds, and sizes that nothing speaks for."""
+"""Fits of long free runs with incomplete models, bounds, and sizes that the recordings do not reach."""
 
 import dataclasses
 
@@ -42,7 +42,7 @@ def recorded(effects, seed: int = 3, seconds: float = SECONDS, fs: float = 250.0
 
 @pytest.fixture(scope="module")
 def lacking():
-    """Friction that sticks more than it slides and a dead zone; the model has Coulomb friction alone."""
+    """A machine with Stribeck friction, dead zone and cubic spring; the model has Coulomb friction alone."""
     effects = {
         ("stribeck", "hub"): 1.0,
         ("dead_zone", "input"): {"width": 0.2},
@@ -61,7 +61,7 @@ def likelihood(model: Mechanism, rec: Recording, x0: np.ndarray) -> float:
 
 
 def test_a_long_run_of_a_model_that_lacks_something_ends_at_the_best_end_of_scipy(lacking):
-    """The same likelihood through `scipy.optimize.least_squares`, slopes by differences, from four starts."""
+    """Reference: the best end of `scipy.optimize.least_squares` on the same residuals, from four starts."""
     rec, start, found, _ = lacking
     assert found.status == "converged"
     names = list(found.free_names)
@@ -86,7 +86,7 @@ def test_a_long_run_of_a_model_that_lacks_something_ends_at_the_best_end_of_scip
         first = first + spread * rng.standard_normal(len(first))
         end = least_squares(residuals, first, diff_step=1e-5, max_nfev=40)
         best = min(best, likelihood(*(at(end.x)[0], rec, at(end.x)[1])))
-    # Errors go on for tens of samples: a few nats of so many are less than an interval.
+    # Errors are correlated over tens of samples: with them a few nats are less than a confidence interval.
     assert found.cost < best + 5.0
     assert found.cost == pytest.approx(best, abs=0.01 * rec.N)
 
@@ -94,7 +94,7 @@ def test_a_long_run_of_a_model_that_lacks_something_ends_at_the_best_end_of_scip
 def test_fits_restart_only_where_something_is_missing(lacking):
     assert any("restart" in line for line in lacking[3])
     again: list[str] = []
-    nearby = fit(lacking[2].model, lacking[0], progress=again.append)  # it begins near and converges
+    nearby = fit(lacking[2].model, lacking[0], progress=again.append)  # it starts near that end
     assert any("restart" in line for line in again) and nearby.cost < lacking[2].cost + 5.0
     rec, plant = recorded([("coulomb", "hub")])
     lines: list[str] = []
@@ -106,7 +106,10 @@ def test_fits_restart_only_where_something_is_missing(lacking):
 
 
 def test_restarts_find_no_less_than_the_law_that_is_contained_finds():
-    """LuGre friction has Coulomb's as a limit, so its least cost is no higher; one start may end above it."""
+    """LuGre friction has Coulomb friction as a limit, so its least cost is no higher.
+
+    A fit from a single start may end above it in a local minimum.
+    """
     rec, _ = recorded(
         {("stribeck", "hub"): 1.0, ("dead_zone", "input"): {"width": 0.2}, ("cubic_spring", "joint"): 1.0},
         seed=13,
@@ -122,7 +125,7 @@ def test_restarts_find_no_less_than_the_law_that_is_contained_finds():
 
 
 def linear_run(damping: float, emf: float = 1.0) -> Recording:
-    """A joint without friction by the matrix exponential, its joint and its back-EMF damped otherwise."""
+    """A joint without friction by the matrix exponential, with a given damping and factor of the back-EMF."""
     p = paper().named_values
     Jh, Ja, k = p["hub.inertia.inertia"], p["arm.inertia.inertia"], p["joint.spring.stiffness"]
     gain = p["hub.motor.gear_ratio"] * p["hub.motor.torque_constant"] / p["hub.motor.resistance"]
@@ -153,14 +156,14 @@ def test_a_joint_that_would_feed_energy_in_is_held_at_none_and_that_is_said():
 
 
 def test_a_damper_beside_a_motor_may_take_away_what_the_motor_has_too_much():
-    """The back-EMF is a tenth less than what is trusted: the damper says so."""
+    """The back-EMF is a tenth below the trusted one: the damper becomes negative by the difference."""
     m = paper()
     p = m.named_values
     constant, emf = p["hub.motor.torque_constant"], p["hub.motor.back_emf"]
     motor = p["hub.motor.gear_ratio"] ** 2 * constant * emf / p["hub.motor.resistance"]
     found = fit(paper(stiffness=1.4), linear_run(0.002, emf=0.9))["hub.viscous.coefficient"]
     assert found.value == pytest.approx(-0.1 * motor, abs=4 * found.std)
-    # It cannot take away more: the ends of the ranges, and an armature that takes time damps no less.
+    # The range ends where the damper cancels the damping of the motor, with and without inductance.
     k = m.parameter_names.index("hub.viscous.coefficient")
     low, high = physical_ranges(m)
     assert low[k] * m.parameter_specifications[k].typical == pytest.approx(-motor) and high[k] == np.inf
@@ -170,7 +173,7 @@ def test_a_damper_beside_a_motor_may_take_away_what_the_motor_has_too_much():
 
 
 def test_windows_are_driven_by_the_voltage_of_the_whole_recording():
-    """Delay, lag and memories go on where a window begins, as in the errors over windows of the result."""
+    """Delay, lag and memories continue across windows in the fit, as in `simulate_windows`."""
     rec, _ = recorded([("coulomb", "hub")], seconds=3.0)
     late = np.concatenate([np.zeros(6), rec.u[:-6]])
     rec = Recording(u=rec.u, y=np.array(recorded_under(late)), Ts=rec.Ts, accept=("units",))
@@ -187,7 +190,7 @@ def test_windows_are_driven_by_the_voltage_of_the_whole_recording():
 
 
 def recorded_under(voltage: np.ndarray) -> np.ndarray:
-    """Outputs of the machine of the same seed, with friction, under another voltage."""
+    """Outputs of the machine with the same seed and friction, under another voltage."""
     return make_record([("coulomb", "hub")], seed=3, fs=250.0, played=voltage)["y"]
 
 
@@ -202,9 +205,9 @@ def test_a_size_that_no_signal_reaches_is_said():
     reach = Reach.of(Model(model), [rec])
     near = model.with_values({"input.saturation.limit": 2.9 * reach.input})
     assert not beyond_recordings(near, reach)
-    # What is trusted is known by other means.
+    # A trusted parameter is known by other means.
     assert not beyond_recordings(model.trust("input.saturation.limit"), reach)
-    # Speeds and travel at ports that the channels determine, of either sign and whatever the offset.
+    # Largest speed and half the travel at a port, whatever their sign and offset.
     hub = np.gradient(rec.y[:, 0], rec.Ts)
     assert reach.speed["hub"] == pytest.approx(np.abs(hub).max(), rel=0.2)
     assert reach.position["hub"] == pytest.approx(np.ptp(rec.y[:, 0]) / 2, rel=0.05)
@@ -213,7 +216,7 @@ def test_a_size_that_no_signal_reaches_is_said():
 
 
 def test_a_cogging_that_repeats_less_than_half_a_time_is_beyond_the_recordings():
-    """Half a period within the motion is a phase of pi over it; the limit is a little below."""
+    """Half a period within the motion is a phase of pi; the limit is 3 rad."""
     cogging = fx.Cogging(at="hub", sine=0.01, periods=4.0)
     name = "hub.cogging.periods"
     for travel, hidden in ((2.8, True), (3.1, False)):  # phase over the whole motion [rad]
@@ -252,7 +255,7 @@ def test_a_search_leaves_out_candidates_of_sizes_that_no_signal_reaches():
 def test_a_search_leaves_out_sensors_that_could_not_read_what_was_recorded(
     share: float, plausible: bool, monkeypatch: pytest.MonkeyPatch
 ):
-    """A cubic error whose readings turn round just below and just above the largest one of the recordings."""
+    """A cubic error limits the readings, here to 2 % below or above the largest recorded one."""
     found, location = sp.recordings(sp.records()), EffectLocation("sensor_cubic", "theta")
     sizes = scales(Model(sp.baseline()), found, sp.dataset(found).torque_scale)
     s = build(sp.baseline(), [(fx.SensorCubic, "theta")], sizes)
@@ -264,12 +267,12 @@ def test_a_search_leaves_out_sensors_that_could_not_read_what_was_recorded(
         prediction = type("Prediction", (), {"problem": at})
 
     def turn(cubic: float) -> float:
-        """The largest reading before readings fall again, on a grid."""
+        """The largest reading before the readings decrease, on a grid."""
         value = np.linspace(0.0, 20 * largest, 200_001)
         reading = value + cubic * value**3
         return float(reading[: int(np.argmax(np.diff(reading) < 0)) + 1].max())
 
-    # A cubic error acts alike at any scale: `cubic value^2` counts.
+    # The relative error depends on `cubic value^2` only, so one maximum gives those of all coefficients.
     cubic = -((turn(-1.0) / (share * largest)) ** 2)
     assert turn(cubic) == pytest.approx(share * largest, rel=1e-3)
     h = sp.start(at, locations=(*s.calibrations, location))
@@ -287,7 +290,7 @@ def test_a_search_leaves_out_sensors_that_could_not_read_what_was_recorded(
 
 
 def test_nats_of_errors_that_go_on_count_less():
-    """A constant under first-order errors: (1 + a) / (1 - a) of them say what one would."""
+    """With AR(1) errors and a constant slope, (1 + a) / (1 - a) nats count as one of white errors."""
     rng, a, N = np.random.default_rng(2), 0.9, 40_000
     e = lfilter([np.sqrt(1 - a**2)], [1.0, -a], rng.standard_normal(N))[:, None]
     X = np.ones((N, 1, 1))
@@ -308,13 +311,13 @@ def test_a_step_within_a_box_is_that_of_scipy():
         reference = lsq_linear(A, b, (low, high), method="bvls", tol=1e-14)
         x, at_end = solution_within(A.T @ A, A.T @ b, low, high)
         ours = 0.5 * np.sum((A @ x - b) ** 2)
-        # Letting go of an end is tried once for each entry, which may leave a little.
+        # Each entry is released from its bound at most once, so a small excess of cost may remain.
         assert reference.cost <= ours * (1 + 1e-9) and ours <= reference.cost * 1.02
         assert ((x >= low) & (x <= high)).all() and (at_end >= ((x == low) | (x == high))).all()
 
 
 def test_a_minimisation_ends_in_the_unit_of_its_end():
-    """Large at first, when little is asked of a step, and one at the end, when all of it is."""
+    """A unit that is large only at first does not stop the minimisation early; one that stays large does."""
 
     def valley(x: np.ndarray) -> NormalEquations:
         J = np.array([[-1.0, 0.0], [-20 * x[0], 10.0]])

@@ -1,4 +1,4 @@
-"""What a machine can know, against results that are known, and what a recording of it can."""
+"""Structural identifiability against known results, and practical identifiability from a recording."""
 
 import dataclasses
 import json
@@ -40,7 +40,7 @@ def two_masses(*outputs: tuple[str, str], free_gain: bool = False) -> Mechanism:
 def test_the_flexible_joint_has_one_unknown_scale():
     """Voltage and angles determine torques up to one common factor.
 
-    M q'' + D q' + K q = B v is the same equation when all of M, D, K and B are multiplied by a number.
+    M q'' + D q' + K q = B v is the same equation when all of M, D, K and B are multiplied by one factor.
     """
     free = identifiable(JOINT.release(ARM))
     assert free.exact and free.rank == len(free.free) - 1
@@ -54,7 +54,7 @@ def test_the_flexible_joint_has_one_unknown_scale():
 
 
 def test_the_scale_is_open_with_friction_too():
-    """The same machine with dry friction, by the rank of sensitivities in place of exact arithmetic."""
+    """The same machine with dry friction, by the rank of sensitivities instead of exact arithmetic."""
     found = identifiable((JOINT + Coulomb("hub")).release(ARM))
     assert not found.exact and len(found.unknown) == 1
     np.testing.assert_allclose(list(found.unknown[0].shares.values()), 1.0, atol=1e-5)
@@ -64,17 +64,17 @@ def test_the_scale_is_open_with_friction_too():
 
 
 def test_two_masses_are_known_from_the_motor_alone():
-    """From motor torque to motor speed both inertias, the shaft and all dampers follow.
+    """Motor torque and motor speed determine both inertias, the shaft and all dampers.
 
-    The transfer function of order 3 has three coefficients above and three below the line: six numbers for
-    six parameters, locally one to one. Source: S. Villwock and M. Pacas, IEEE Trans. Ind. Electron. 55, 2008
-    (identification of a two-mass drive from motor-side signals).
+    The transfer function of order 3 has three coefficients in the numerator and three in the denominator: six
+    coefficients for six parameters, locally one to one. Source: S. Villwock and M. Pacas, IEEE Trans. Ind.
+    Electron. 55, 2008 (identification of a two-mass drive from motor-side signals).
     """
     motor_speed = ("motor", "speed")
     assert identifiable(two_masses(motor_speed)).structural
     gain = identifiable(two_masses(motor_speed, free_gain=True))
     assert gain.rank == 6 and len(gain.free) == 7 and len(gain.unknown) == 1
-    # The load's side alone gives no zeros: five coefficients of a third-order system for six parameters.
+    # To the speed of the load the numerator has two coefficients: five in all for six parameters.
     load = identifiable(two_masses(("load", "speed")))
     assert load.rank == 5 and "the speed of motor" in load.sensors
     assert load.sensors["the speed of motor"] == 0
@@ -82,7 +82,7 @@ def test_two_masses_are_known_from_the_motor_alone():
 
 
 def test_a_resistance_hides_behind_the_torque_constant():
-    """Only their ratio turns voltage into torque; back-EMF and friction at the hub are one damping."""
+    """Only torque constant over resistance is determined; back-EMF and hub friction are one damping."""
     found = identifiable(JOINT.release("hub.motor.resistance"))
     (one,) = found.unknown
     assert one.shares == {"hub.motor.torque_constant": 1.0, "hub.motor.resistance": 1.0}
@@ -92,7 +92,7 @@ def test_a_resistance_hides_behind_the_torque_constant():
     assert set(one.parameters) == {"hub.motor.back_emf", "hub.viscous.coefficient"}
     several = identifiable(JOINT.release("hub.motor.back_emf", "hub.motor.resistance", ARM))
     assert len(several.unknown) == 3 and all(len(names) == 3 for names in several.trust)
-    for names in several.trust[:3]:  # each set does what it says
+    for names in several.trust[:3]:  # trusting any of the sets is enough
         assert identifiable(
             JOINT.release("hub.motor.back_emf", "hub.motor.resistance", ARM).trust(*names)
         ).structural
@@ -116,7 +116,7 @@ def test_two_dampers_at_one_port_are_a_sum():
 
 
 def test_what_has_no_effect_is_named():
-    """A spring between coordinates that nothing drives and no sensor sees."""
+    """A spring at a coordinate that nothing drives and no sensor measures."""
     m = Mechanism(
         ("x", "z"),
         {"p": (1, 0), "away": (0, 1)},
@@ -168,7 +168,7 @@ def test_arithmetic_of_duals_and_null_space():
 
 
 def pendulum() -> tuple[Mechanism, rf.Recording]:
-    """A servo that lifts one known mass slowly, with friction that grows with the load."""
+    """A servo that lifts one known mass slowly, with friction that depends on the load."""
     m = joints.xl330_pendulum() + LoadFriction("hub")
     u = 0.5 * np.sin(2 * np.pi * 0.5 * 0.01 * np.arange(600))
     y = rf.simulate(m, u, 0.01) + 1e-3 * np.random.default_rng(0).normal(size=(600, 1))
@@ -176,7 +176,7 @@ def pendulum() -> tuple[Mechanism, rf.Recording]:
 
 
 def test_one_mass_does_not_say_how_friction_depends_on_the_load():
-    """In principle it does; one slow run of one mass leaves both shares open against each other.
+    """The shares are structurally identifiable, but one slow run with one mass determines them badly.
 
     Source: M. Duclusaud, G. Passault, V. Padois and O. Ly, arXiv 2410.08650, 2024, who record several masses
     and lengths for the friction that depends on the load.
@@ -191,7 +191,7 @@ def test_one_mass_does_not_say_how_friction_depends_on_the_load():
 
 
 def test_standard_deviations_of_a_recording_are_those_of_least_squares():
-    """White noise of a known size: those of a fit to the same recording, as shares of the values."""
+    """Reference: the standard deviations of a fit to the same recording with white noise, as shares."""
     u = rf.data.excitation.noise(600, 0.004, seed=1, rms=2.0)
     m = JOINT.with_values({"hub.viscous.coefficient": 0.01, "joint.viscous.coefficient": 0.004})
     y = rf.simulate(m, u, 0.004) + 1e-3 * np.random.default_rng(1).normal(size=(600, 2))
@@ -201,7 +201,7 @@ def test_standard_deviations_of_a_recording_are_those_of_least_squares():
     for k, name in enumerate(fit.free_names):
         std = np.sqrt(fit.covariance[k, k]) / abs(fit[name].value)
         assert of_fit.std[name] == pytest.approx(std, rel=1e-6)
-        assert found.std[name] == pytest.approx(std, rel=0.5)  # without what correlation in time adds
+        assert found.std[name] == pytest.approx(std, rel=0.5)  # without the part by correlation in time
     assert found.structural
 
 
@@ -215,7 +215,7 @@ def test_it_is_shown_and_written():
 
 
 def test_a_motor_side_sensor_alone_knows_the_paper_joint():
-    """The same as the two-mass drive, with the deflection not measured."""
+    """The angle of the hub alone determines all parameters, as for the two-mass drive."""
     hub = dataclasses.replace(JOINT, outputs={"theta": "hub"})
     assert identifiable(hub).structural
     deflection = dataclasses.replace(JOINT, outputs={"alpha": "joint"})
@@ -228,7 +228,7 @@ def test_check_says_it_of_a_model_that_is_named(tmp_path, monkeypatch, capsys):
     from rotflex_jax.data import save_csv
     from rotflex_jax.runtime import xla
 
-    # What the program sets up for its own process must not leak into the other tests.
+    # Settings of the program for its own process must not affect other tests.
     monkeypatch.setattr(xla, "enable_fast_loops", lambda: True)
     monkeypatch.setattr(xla, "enable_compilation_cache", lambda: None)
     u = rf.data.excitation.noise(600, 0.004, seed=1, rms=2.0)

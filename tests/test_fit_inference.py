@@ -1,4 +1,4 @@
-"""Intervals that keep their promise: white, correlated and unequal residuals; constants from both sides."""
+"""Coverage of intervals for white, correlated and unequal residuals; limits tested from both sides."""
 
 import numpy as np
 import pytest
@@ -35,7 +35,7 @@ def regressors(seed: int = 0) -> np.ndarray:
 
 
 def experiments(noise):
-    """Least squares of known numbers, many times: errors (RUNS, 3) and both covariances."""
+    """Repeated least-squares fits: errors of the parameters (RUNS, 3), robust and plain covariances."""
     X = regressors()
     H = np.linalg.inv(X[:, 0].T @ X[:, 0])
     rng = np.random.default_rng(1)
@@ -51,14 +51,14 @@ def experiments(noise):
 
 
 def coverage(errors: np.ndarray, covariances: np.ndarray) -> np.ndarray:
-    """How often the 95 % interval holds the truth, per parameter."""
+    """Share of the runs whose 95 % interval contains the true value, for each parameter."""
     std = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
     return np.mean(np.abs(errors) < 1.96 * std, axis=0)
 
 
 def test_white_residuals_give_the_ordinary_formula():
     errors, robust, plain = experiments(lambda rng: rng.normal(size=N))
-    # Never less than the ordinary one, and more only by the scatter of sums over many lags.
+    # Never less than the ordinary variance, and more only by the scatter of sums over many lags.
     assert (np.diagonal(robust, axis1=1, axis2=2) >= 0.999 * np.diagonal(plain, axis1=1, axis2=2)).all()
     np.testing.assert_allclose(np.diagonal(robust.mean(axis=0)), np.diagonal(plain.mean(axis=0)), rtol=0.15)
     np.testing.assert_allclose(np.diagonal(robust.mean(axis=0)), errors.var(axis=0), rtol=0.2)
@@ -78,7 +78,7 @@ def test_correlated_residuals_keep_their_coverage():
 
 
 def test_unequal_residuals_keep_their_coverage():
-    """Noise that is large where the regressor is: the ordinary formula is too sure of that one."""
+    """If noise is large where a regressor is, the ordinary interval of its parameter is too narrow."""
     size = 0.1 + regressors()[:, 0, 1] ** 2
     errors, robust, plain = experiments(lambda rng: size * rng.normal(size=N))
     assert coverage(errors, plain)[1] < 0.8
@@ -86,9 +86,9 @@ def test_unequal_residuals_keep_their_coverage():
 
 
 def test_recordings_do_not_mix():
-    """A drift from one recording to the next is no correlation within either."""
+    """Products of residuals do not cross recordings; reference: the sums over lags of each, written out."""
     rng = np.random.default_rng(3)
-    # Correlated, so that the lags count.
+    # The residuals are correlated, so that the lags matter.
     e = np.concatenate([lfilter([1.0], [1.0, -0.6], rng.normal(size=(n, 1)), axis=0) for n in (400, 600)])
     J = np.ones((1000, 1, 1))
     whole = robust_covariance(J, e, np.zeros(1000, int))
@@ -105,7 +105,7 @@ def test_recordings_do_not_mix():
 
 
 def test_what_a_recording_does_not_move_need_not_be_there():
-    """Two recordings with an offset of their own each: the same with and without the columns of zeros."""
+    """Two recordings with an offset each: the covariance is the same with and without columns of zeros."""
     rng = np.random.default_rng(8)
     segments = np.repeat([0, 1], [400, 600])
     slope, e = rng.normal(size=(1000, 2, 1)), rng.normal(size=(1000, 2))
@@ -130,7 +130,7 @@ def test_two_channels_may_be_correlated():
 
 
 def test_scale_of_residuals_and_slopes():
-    """Standard deviations follow the size of the residuals and the inverse of the slopes."""
+    """Standard deviations are proportional to the residuals and inversely proportional to the slopes."""
     rng = np.random.default_rng(5)
     J, e = rng.normal(size=(500, 2, 3)), rng.normal(size=(500, 2))
     one, zeros = robust_covariance(J, e, np.zeros(500, int)), np.zeros(500, int)
@@ -171,7 +171,7 @@ def spread(J: np.ndarray, e: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize(("relative", "determined"), [(1e-9, True), (1.05e-11, True), (0.95e-11, False)])
 def test_a_direction_is_determined_down_to_a_curvature(relative: float, determined: bool) -> None:
-    """Two columns that differ by a little: the smaller eigenvalue of their correlation is `relative`."""
+    """Two nearly equal columns: the smaller eigenvalue of their correlation matrix is `relative`."""
     rng = np.random.default_rng(0)
     basis = np.linalg.qr(rng.standard_normal((COUNT, 2)))[0]
     angle = 2 * np.arcsin(np.sqrt(relative / 2))  # 1 - cos(angle) = relative
@@ -181,7 +181,7 @@ def test_a_direction_is_determined_down_to_a_curvature(relative: float, determin
 
 @pytest.mark.parametrize(("share", "lost"), [(1.05e-3, True), (0.95e-3, False)])
 def test_who_has_a_part_in_what_is_not_determined_has_no_interval(share: float, lost: bool) -> None:
-    """The second column is the first and a little of the third: of the three only sums are determined."""
+    """The second column is the first plus `sqrt(2) share` of the third, so one direction is undetermined."""
     rng = np.random.default_rng(1)
     a, b = np.linalg.qr(rng.standard_normal((COUNT, 2)))[0].T
     std = spread(np.column_stack([a, a + np.sqrt(2) * share * b, b]), rng.standard_normal(COUNT))
@@ -189,7 +189,7 @@ def test_who_has_a_part_in_what_is_not_determined_has_no_interval(share: float, 
 
 
 def test_lags_go_as_far_as_the_root_of_the_samples() -> None:
-    """A weak correlation that lasts is seen in no single lag of white residuals."""
+    """A weak but long correlation is not visible in single lags, so sqrt(N) lags are used in any case."""
     white = np.random.default_rng(2).standard_normal((COUNT, 1))
     assert bandwidth(white) == 100
     assert bandwidth(white[:50]) == 5  # a tenth of the samples at most
@@ -205,7 +205,7 @@ def test_nats_of_white_errors_count_each(D: int) -> None:
 
 
 def test_nats_of_errors_that_go_on_count_less() -> None:
-    """Of an AR(1) with a constant slope the information counts (1 + a) / (1 - a) times over."""
+    """With AR(1) errors and a constant slope, (1 + a) / (1 - a) nats count as one of white errors."""
     rng, a, most = np.random.default_rng(4), 0.8, []
     for _ in range(20):
         w = rng.standard_normal(COUNT)
@@ -235,7 +235,10 @@ def test_slopes_or_errors_that_are_no_numbers_determine_nothing() -> None:
 def test_errors_are_correlated_above_a_twentieth_and_above_their_scatter(
     samples: int, share: float, length: int
 ) -> None:
-    """Neighbours whose correlation is that by construction: 0.05, or 2 over the root of the samples."""
+    """Residuals with a correlation at lag one that is 1 % below or above the limit, by construction.
+
+    The limit is the larger one of 0.05 and 2 / sqrt(N).
+    """
     limit, w = max(0.05, 2 / np.sqrt(samples)), np.random.default_rng(7).standard_normal(samples)
 
     def neighbours(part: float) -> tuple[np.ndarray, float]:
@@ -268,12 +271,12 @@ def test_an_offset_of_residuals_is_no_correlation() -> None:
 
 
 def test_what_lies_beyond_one_small_value_is_noise() -> None:
-    """Of a moving average with lags 1 and 3 the second lag is small, so that the third does not count."""
+    """Autocorrelation is large at lags 1 and 3 and small at lag 2, so lag 3 does not count."""
     w = np.random.default_rng(10).standard_normal(100_000)
     e = lfilter([1.0, 0.2, 0.0, 0.2], [1.0], w)
     r = np.array([e[k:] @ e[: len(e) - k] for k in range(5)]) / (e @ e)
     assert r[1] > 0.1 > 0.05 > r[2] and r[3] > 0.1 and abs(r[4]) < 0.05
-    assert correlation_length(e[:, None]) == 4  # twice the two samples that it lasts
+    assert correlation_length(e[:, None]) == 4  # twice the two samples of lags 0 and 1
 
 
 def test_one_residual_more_than_parameters_has_the_textbook_variance() -> None:

@@ -1,4 +1,4 @@
-"""Batch fits of a basis: against normal equations and numpy, and what friction does to the degrees."""
+"""Batch fits of a basis against normal equations and numpy, and the effect of friction on the degrees."""
 
 import functools
 
@@ -25,7 +25,7 @@ def record(N: int = 600, seed: int = 0, sigma: float = 0.1) -> Recording:
 
 @functools.cache
 def joint(name: str, N: int = 6000, seed: int = 5, sign: float = 1.0) -> Recording:
-    """Deflection of a joint with known faults, every 0.1 s; steps of 1 ms are enough for signs and sizes."""
+    """Deflection of a joint with known effects, every 0.1 s; steps of 1 ms are enough for signs and sizes."""
     Ts = 0.1
     u = sign * noise(N, Ts, seed=seed)
     return Recording(u=u, y=response(plant(name), u, Ts, step=1e-3)[:, 1], Ts=Ts, channels="alpha")
@@ -75,12 +75,12 @@ def test_any_problem_is_solved_as_numpy_solves_it(seed: int, ridge: float, rank:
     rng = np.random.default_rng(seed)
     phi = rng.standard_normal((30, rank)) @ rng.standard_normal((rank, 6))
     y = rng.standard_normal(30)
-    # A ridge is as many more rows of zeros that are to be hit.
+    # A ridge is equivalent to one more row for each weight, with zero as its target.
     padded = np.concatenate([phi, np.sqrt(ridge) * np.eye(6)])
     target = np.concatenate([y, np.zeros(6)])
     expected = np.linalg.lstsq(padded, target, rcond=1e-9)[0]
     found = solve(factor(np.column_stack([phi, y])), ridge)
-    # Minimum norm depends on the units of the columns, the modelled output does not.
+    # The minimum norm depends on the units of the columns, the modelled output does not.
     np.testing.assert_allclose(phi @ found.w, phi @ expected, atol=1e-7)
     assert found.rank == rank
     if ridge or rank == 6:
@@ -100,7 +100,7 @@ def test_the_full_layout_has_the_minimum_norm_and_that_is_symmetric() -> None:
         np.testing.assert_allclose(
             full.model.kernels()[degree], triangular.model.kernels()[degree], atol=1e-13
         )
-    # An interval of the symmetric kernel: of a product with two orders half that of the one weight.
+    # In the symmetric kernel a product has two equal entries, each with half the std of the single weight.
     wide = triangular["u[t] * u[t-1]"].std
     assert full["u[t] * u[t-1]"].std == pytest.approx(wide / 2, rel=1e-6)
     assert full.condition == pytest.approx(triangular.condition, rel=2.0)
@@ -108,13 +108,13 @@ def test_the_full_layout_has_the_minimum_norm_and_that_is_symmetric() -> None:
 
 def test_a_column_of_zeros_has_no_interval() -> None:
     u = np.random.default_rng(0).standard_normal(300)
-    u[:] = np.sign(u)  # then u^2 is the constant
+    u[:] = np.sign(u)  # then u^2 equals the constant
     r = Recording(u=u, y=2 * u + 0.01 * np.cos(np.arange(300.0)), Ts=0.1, channels="alpha")
     fit = least_squares(Volterra(Delays(1)), r)
     assert fit.rank == 2
     assert fit.weights[0] == pytest.approx(fit.weights[2])
     late = Recording(u=np.eye(1, 300)[0], y=r.y, Ts=0.1, channels="alpha")
-    silent = least_squares(Volterra(Delays(2), 1), late)  # the impulse lies in the first samples
+    silent = least_squares(Volterra(Delays(2), 1), late)  # the impulse is in the samples that are left out
     assert np.isnan(silent.std[1:]).all()
     assert silent["u[t]"].note == "not determined by these data"
 
@@ -139,7 +139,7 @@ def test_a_ridge_is_a_penalty_on_the_weights_as_they_are() -> None:
     expected = np.linalg.solve(phi.T @ phi + 5.0 * np.eye(10), phi.T @ y)
     np.testing.assert_allclose(fit.weights, expected, atol=1e-12)
     assert fit.ridge == 5.0
-    # Noise enters shrunk as the weights are; where it is all there is, that is the interval.
+    # A ridge shrinks the noise of the weights like the weights, here to a half, and so the intervals.
     loud = record(3000, sigma=30.0)
     plain, shrunk = (
         least_squares(Volterra(Delays(3), 1, constant=False), loud, ridge=k) for k in (0.0, 2980.0)
@@ -148,7 +148,7 @@ def test_a_ridge_is_a_penalty_on_the_weights_as_they_are() -> None:
 
 
 def test_cross_validation_finds_the_ridge_that_pays() -> None:
-    # 120 samples for 91 weights that are nearly all nothing, and a coloured input.
+    # 120 samples for 91 weights, nearly all of them zero, and a coloured input.
     u = noise(900, 0.1, bandwidth=1.0, seed=1)
     rng = np.random.default_rng(2)
     y = np.convolve(u, 0.7 ** np.arange(12))[:900] + 0.5 * rng.standard_normal(900)
@@ -162,10 +162,10 @@ def test_cross_validation_finds_the_ridge_that_pays() -> None:
         return float(np.mean((fit.model.simulate(test)[12:, 0] - test.y[12:, 0]) ** 2))
 
     assert error(chosen) < 0.5 * error(plain)
-    # No ridge of a fine grid is much better on data that nobody saw.
+    # No ridge of a grid is much better on the test data.
     grid = [error(least_squares(basis, train, ridge=k, skip=12)) for k in np.logspace(-2, 4, 13)]
     assert error(chosen) < 1.5 * min(grid)
-    # Where data abound, next to nothing is taken.
+    # With many data the ridge is small.
     assert least_squares(Volterra(Delays(2)), record(5000), ridge="cv").ridge < 50
 
 
@@ -173,7 +173,7 @@ def test_symmetric_friction_has_no_quadratic_kernel() -> None:
     fit = least_squares(Volterra(Delays(5)), joint("S1"))
     quadratic = fit.model.basis.degrees == 2
     assert np.max(np.abs(fit.t[quadratic])) < 4
-    # The lag of zero carries nothing either: the voltage needs a sample to be seen.
+    # The weight at lag zero is left out: the voltage acts on the deflection one sample later.
     assert np.min(np.abs(fit.t[2:6])) > 5
     assert fit.nmse == pytest.approx(0.0174, abs=0.002)
 
@@ -195,7 +195,7 @@ def test_what_is_not_symmetric_shows_in_the_quadratic_kernel(name: str, least: f
     assert np.max(np.abs(fit.t[quadratic])) > least
     linear = least_squares(Volterra(Delays(5), 1), joint(name))
     assert fit.nmse < (0.85 if name == "S6" else 0.25) * linear.nmse
-    # Without a constant the squares have to carry the mean as well.
+    # Without a constant the quadratic terms have to represent the mean as well.
     bent = least_squares(Volterra(Delays(5), constant=False), joint(name))
     assert fit.nmse < bent.nmse
     if name == "S5s":
@@ -210,7 +210,7 @@ def test_an_orthogonalised_basis_gives_the_same_model() -> None:
     one, other = least_squares(raw, r), least_squares(GramSchmidt.of(raw, r.u), r)
     np.testing.assert_allclose(one.model.simulate(r), other.model.simulate(r), atol=1e-12)
     assert other.condition < 1.2 < one.condition
-    # Errors of a combination come out the same from either side.
+    # The covariance of the original weights is the same from both bases.
     T = np.asarray(other.model.basis.transform)
     np.testing.assert_allclose(T @ other.covariance @ T.T, one.covariance, rtol=1e-6, atol=1e-12)
 

@@ -1,4 +1,4 @@
-"""Many starts of a grey-box fit, on recordings of the arena's simulator and beside scipy."""
+"""Many starts of a grey-box fit, on recordings of the arena's simulator and against scipy."""
 
 import jax
 import jax.numpy as jnp
@@ -56,14 +56,14 @@ def test_one_pass_has_the_sums_that_differences_of_runs_have(effect) -> None:
         sums = jax.jit(normal_equations, static_argnums=(0, 1))
         got = jax.device_get(sums(structure, Exponential(), numbers, ways, samples, jnp.asarray(scale)))
     np.testing.assert_allclose(got.cost, e @ e / 2, rtol=1e-10)
-    # A difference across the instant at which friction lets go is not quite a slope.
+    # A difference quotient across the instant at which friction breaks away is not quite the derivative.
     np.testing.assert_allclose(got.gradient, J.T @ e, rtol=1e-4, atol=1e-4 * np.abs(J.T @ e).max())
     np.testing.assert_allclose(got.H, J.T @ J, rtol=1e-4, atol=1e-4 * np.diag(J.T @ J).min())
 
 
 @pytest.fixture(scope="module")
 def found():
-    """Two recordings fitted jointly from wide starts around numbers that are wrong."""
+    """Two recordings fitted jointly from widely spread starts around wrong parameters."""
     recordings = [recording(3), recording(3, seconds=1.6)]
     wrong = paper(hub_inertia=0.003, stiffness=1.1, hub_damping=0.02, joint_damping=0.01)
     said: list[str] = []

@@ -1,4 +1,4 @@
-"""The toolkit's own Levenberg-Marquardt beside the solvers of optimistix."""
+"""The toolkit's own Levenberg-Marquardt against the solvers of optimistix."""
 
 import optimistix as optx
 import pytest
@@ -35,5 +35,5 @@ def test_solvers_of_optimistix_end_where_the_own_one_does(kind, model, recording
     found = rf.fit(model, recording, minimiser=kind(rtol=1e-7, atol=1e-7))
     assert found.status == own.status == "converged"
     assert found.cost == pytest.approx(own.cost, rel=1e-6)
-    for name in own.free_names:  # the own one stops at 1e-3 nats, which are 0.045 standard deviations
+    for name in own.free_names:  # the toolkit's stops at 1e-3 nats, or 0.045 std
         assert abs(found[name].value - own[name].value) < 0.05 * own[name].std, name

@@ -1,4 +1,4 @@
-"""A sign turned round is told in one sentence; what only looks odd is not."""
+"""A reversed sign of a channel or the input is refused; right signs and rough parameters are accepted."""
 
 import dataclasses
 
@@ -13,7 +13,7 @@ JOINT = rf.Model(rf.joints.paper())
 
 
 def recorded(u: float = 1, theta: float = 1, alpha: float = 1, kind: str = "noise") -> rf.Recording:
-    """A joint with friction and a constant torque, by the independent simulator; signs as given."""
+    """A joint with friction and a voltage offset, by the independent simulator; signs as given."""
     hidden = [("coulomb", "hub"), ("voltage_offset", "input")]
     made = make_record(hidden, kind=kind, seed=107, seconds=8.0, fs=250.0)
     y = made["y"] * np.array([theta, alpha])
@@ -43,7 +43,7 @@ def test_right_signs_pass_whatever_the_input(kind: str) -> None:
 
 
 def test_rough_numbers_pass() -> None:
-    """Every constant wrong by half or twofold."""
+    """Every parameter is wrong by a random factor from 1/2 to 2."""
     rng = np.random.default_rng(5)
     for _ in range(20):
         values = JOINT.mechanism.values * 2.0 ** rng.uniform(-1, 1, len(JOINT.mechanism.values))

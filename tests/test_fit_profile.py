@@ -1,4 +1,4 @@
-"""Profiles of a likelihood: the exact interval of a linear regression, open ends, two minima, words."""
+"""Profile likelihoods: the exact interval of a linear regression, open ends, two minima, messages."""
 
 import functools
 import json
@@ -40,8 +40,8 @@ def profiled() -> Profile:
 
 
 def regression() -> tuple[float, float, float]:
-    """Estimate, its entry of the inverse normal matrix, and the least squared error, in numpy."""
-    gain = 0.1 * 10 / (2.0 * 0.01) / 0.1  # angular acceleration by volt and torque constant: K_g / (R J)
+    """Estimate, its entry of the inverse normal matrix, and the residual sum of squares, in numpy."""
+    gain = 0.1 * 10 / (2.0 * 0.01) / 0.1  # angular acceleration per volt and torque constant, K_g / (R J)
     u = recording().u
     speed = np.concatenate([[0.0], np.cumsum(u)[:-1]]) * TS
     angle = np.concatenate([[0.0], np.cumsum(speed[:-1] * TS + u[:-1] * TS**2 / 2)])
@@ -60,7 +60,7 @@ def test_profile_of_a_linear_regression_is_exact():
         quantile = scipy.stats.chi2.ppf(level, 1) * p.factor
         half = np.sqrt(rss * entry * np.expm1(quantile / N))
         np.testing.assert_allclose(p.interval(level), (value - half, value + half), rtol=0, atol=2e-3 * half)
-    # White errors: the factor is the degrees of freedom that are left, and the interval is that of Student.
+    # White errors: the factor is N over the degrees of freedom, and the interval is that of Student's t.
     assert p.factor == pytest.approx(N / (N - 3), rel=1e-6)
     half = np.sqrt(rss / (N - 3) * entry) * scipy.stats.t.ppf(0.975, N - 3)
     np.testing.assert_allclose(p.interval(), (value - half, value + half), rtol=0, atol=0.01 * half)
@@ -75,7 +75,7 @@ def test_profile_and_wald_agree_where_the_cost_is_a_parabola():
 
 
 def test_a_product_that_alone_is_known_leaves_its_factors_open():
-    """Torque constant over inertia is known, neither of them is."""
+    """Torque constant over inertia is determined; the inertia alone is not."""
     both = rf.fit(axis(CONSTANT, INERTIA), recording())
     assert set(both.profile_advised) == {CONSTANT, INERTIA}
     p = both.profile(INERTIA, recording())
@@ -91,14 +91,14 @@ def test_a_product_that_alone_is_known_leaves_its_factors_open():
 
 
 def test_a_function_of_one_parameter_is_the_same_profile():
-    """Likelihood intervals do not depend on how a quantity is written."""
+    """Likelihood intervals do not depend on the parametrisation; reference: the profile of the parameter."""
     p = rf.profile(fitted(), recording(), lambda values: 1 / values[CONSTANT] ** 2)
     low, high = profiled().interval()
     np.testing.assert_allclose(p.interval(), (1 / high**2, 1 / low**2), rtol=1e-4)
 
 
 def test_a_level_that_is_too_small_to_see_is_open_below():
-    """Friction that is not there: any small level fits, a large one does not."""
+    """Data without friction: any small level fits, a large one does not."""
     m = axis(CONSTANT) + rf.effects.Viscous("hub", coefficient=0.01) + rf.effects.Coulomb("hub", level=0.01)
     m = m.trust("hub.viscous.coefficient")
     u = recording().u
@@ -147,7 +147,7 @@ def test_two_minima_leave_a_gap():
 def test_shapes(drop: list[float], shape: str):
     p = made(drop)
     assert p.shape == shape
-    if shape == "closed":  # the parabola itself
+    if shape == "closed":  # the drop is a parabola
         np.testing.assert_allclose(p.interval(), (-1.95996, 1.95996), atol=1e-4)
         assert not p.wald_is_poor
 
@@ -164,7 +164,7 @@ def test_a_profile_is_shown_and_written():
 
 
 def test_nuisances_are_fitted_anew():
-    """Of a damped machine the torque constant trades with the damping along the profile."""
+    """Along the profile of the torque constant, the damping follows the slope of their covariance."""
     m = axis(CONSTANT) + rf.effects.Viscous("hub", coefficient=0.02)
     y = rf.simulate(m, recording().u, TS) + 0.01 * np.random.default_rng(3).normal(size=(N, 1))
     rec = rf.Recording(u=recording().u, y=y, Ts=TS, channels=("theta",))
@@ -186,7 +186,10 @@ def test_nuisances_are_fitted_anew():
     ids=lambda options: next(iter(options)),
 )
 def test_profiles_are_of_what_was_fitted(options):
-    """Predictions, windows, numbers of each recording: linear in the torque constant, so Wald's interval."""
+    """Fits to predictions, to windows, and with a local parameter.
+
+    The outputs are linear in the torque constant, so the profile gives the Wald interval of the fit.
+    """
     recordings = [recording(), recording()] if "local" in options else [recording()]
     fit = rf.fit(axis(CONSTANT), recordings, **options)
     p = fit.profile(CONSTANT, recordings)
@@ -222,7 +225,7 @@ def test_what_makes_no_sense_is_refused():
 
 
 def test_no_interval_is_wider_than_the_profile():
-    """An end that was not looked for is not an open end."""
+    """A level above that of the profile is refused, not reported as open; reference: a linear regression."""
     with pytest.raises(rf.InputError, match=r"the profile reaches 0.95; make it with level=0.99"):
         profiled().interval(0.99)
     value, entry, rss = regression()
@@ -233,7 +236,10 @@ def test_no_interval_is_wider_than_the_profile():
 
 
 def test_a_difference_may_be_negative():
-    """Half a standard deviation above zero: the interval is the parameter's, moved, and not cut at zero."""
+    """A parameter less a constant, half a standard deviation above zero.
+
+    The interval is that of the parameter, shifted, and is not cut at zero.
+    """
     low, high = profiled().interval()
     shift = profiled().value - profiled().std / 2
     p = rf.profile(fitted(), recording(), lambda values: values[CONSTANT] - shift)

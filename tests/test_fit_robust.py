@@ -1,4 +1,4 @@
-"""Fits in which large errors count by their size: against scipy's, with a model that is wrong for a while."""
+"""Robust fits, in which large errors count linearly, against scipy on a run that is disturbed for a while."""
 
 import dataclasses
 
@@ -32,7 +32,7 @@ def machine() -> rf.Mechanism:
 
 @pytest.fixture(scope="module")
 def knocked() -> rf.Recording:
-    """A run with noise, in which something pushes the arm for a tenth of the time."""
+    """A run with noise, and with a disturbance of the measured angle for a tenth of the time."""
     u = rf.data.excitation.multisine(N, TS, rms=1.0, seed=2)
     y = rf.simulate(machine(), u, TS) + np.random.default_rng(0).normal(0, 1e-3, (N, 1))
     y[200:240, 0] += 0.4 * np.hanning(40)
@@ -58,7 +58,7 @@ def test_it_ends_where_scipys_does_and_near_the_truth(knocked):
     np.testing.assert_allclose(values, with_scipy.x, rtol=2e-3)
     away = lambda fit: max(abs(fit[n].value / t - 1) for n, t in zip(NAMES, TRUTH, strict=True))  # noqa: E731
     assert away(found) < 0.04 and away(plain) > 3 * away(found)
-    # A profile of it bends the same errors.
+    # The profile uses the same robust cost.
     low, high = found.profile(NAMES[0], knocked).interval(0.95)
     assert low < values[0] < high
 
@@ -71,7 +71,10 @@ def test_what_cannot_be_asked_for(knocked):
 
 
 def test_friction_of_the_motors_torque_alone_lets_go_of_a_machine_without_torque():
-    """The level is share times the motor's torque; of both sides it holds against the weight too."""
+    """Friction by the motor's torque alone vanishes with it, so the machine moves as without friction.
+
+    Friction by the torques of both sides depends on the weight too, and changes the motion.
+    """
     base = rf.joints.position_servo(0.007, servo=rf.effects.PositionServo(enabled=0.0), weight=0.48)
     runs = {}
     for of in ("both", "motor"):
@@ -80,7 +83,7 @@ def test_friction_of_the_motors_torque_alone_lets_go_of_a_machine_without_torque
     free = rf.simulate(base, np.zeros(200), 0.005, x0=[1.0, 0.0])[:, 0]
     np.testing.assert_allclose(runs["motor"], free, atol=1e-9)
     assert np.max(np.abs(runs["both"] - free)) > 0.3
-    # Driven against the weight at rest, the motor must give weight / (1 - share).
+    # To lift the weight slowly, the motor must give weight / (1 - share).
     driven = dataclasses.replace(
         base, effects=tuple(e.replace(enabled=1.0) if e.name == "position_servo" else e for e in base.effects)
     )

@@ -1,4 +1,4 @@
-"""Regressors chosen one by one: the definition of the ratios, the truth found, and when to stop."""
+"""Forward regression: ratios against their definition, recovery of the true terms, and when it stops."""
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ def record(N: int = 3000, sigma: float = 0.1, seed: int = 0) -> Recording:
 
 
 def by_definition(phi: np.ndarray, y: np.ndarray, terms: int) -> tuple[list[int], list[float]]:
-    """Every regressor against the residual of its regression on those chosen, afresh each time."""
+    """Error reduction ratios by definition: each regressor less its regression on those chosen before."""
     order: list[int] = []
     ratios = []
     for _ in range(terms):
@@ -58,13 +58,13 @@ def test_the_true_terms_are_found_and_no_others(seed: int) -> None:
         assert abs(fit[name].value - value) < 4.5 * fit[name].std
     assert "4 terms by held-out blocks" in fit.status
     assert next(iter(fit.err.values())) > 0.4
-    # The constant is not among them, though squares have a mean.
+    # The constant is not chosen, although the quadratic terms have a mean.
     assert fit["1"].value == 0.0
     assert fit["1"].note == "not chosen"
 
 
 def test_chance_gains_of_one_record_are_not_taken() -> None:
-    # The plain minimum of the held-out error takes too many terms in a third of these records.
+    # The plain minimum of the held-out error takes too many terms in a third of these recordings.
     fits = [forward_regression(Volterra(Delays(5)), record(400, 0.5, seed)) for seed in range(20)]
     assert all(set(TRUE) <= set(fit.selected) for fit in fits)
     assert sum(len(fit.selected) == 4 for fit in fits) >= 16

@@ -1,4 +1,4 @@
-"""The presets against the numbers of their sources."""
+"""The presets against the values of their sources."""
 
 import jax
 import jax.numpy as jnp
@@ -146,7 +146,7 @@ def test_the_makers_presets():
 
 
 def test_single_inertia_answers_like_a_first_order_lag():
-    """Speed of a servo under a voltage: gain 1 / (km Kg), time constant J / (damping)."""
+    """The speed has the rate (drive km Kg + damping) / J and the acceleration drive / J per volt."""
     servo = joints.single_inertia(0.0021, damping=0.01)
     space = linearise(servo)
     drive, damping = 0.2065, 0.2065 * 0.00767 * 70 + 0.01
@@ -170,7 +170,7 @@ def test_single_inertia_stands_for_a_linear_axis():
     ("sensors", "row"), [("theta", 0), ("alpha", 1), ("speed", 2), (["alpha", "speed"], 1)]
 )
 def test_sensors_of_a_joint(preset: str, sensors: str | list[str], row: int) -> None:
-    """The equations are those with both sensors; the output is the row of the state that it says."""
+    """The equations are those with both sensors, and the output is the state that the sensor measures."""
     both, some = getattr(joints, preset)(), getattr(joints, preset)(sensors=sensors)
     assert some.channels == ((sensors,) if isinstance(sensors, str) else tuple(sensors))
     a, b = linearise(both), linearise(some)
@@ -179,9 +179,11 @@ def test_sensors_of_a_joint(preset: str, sensors: str | list[str], row: int) -> 
 
 
 def test_from_the_deflection_alone_a_linear_joint_has_four_numbers() -> None:
-    """Between voltage and deflection; the fifth that is free is for what is not linear.
+    """Four coefficients between voltage and deflection, for five free parameters.
 
-    alpha / V = -c3 s / (s^3 + c2 s^2 + c1 s + c0) / s
+        alpha / V = -c3 s / (s^3 + c2 s^2 + c1 s + c0)
+
+    Only with a nonlinear effect is the fifth parameter, the torque constant, identifiable too.
     """
     alone = joints.paper(sensors="alpha", hub_damping=0.004, joint_damping=0.003)
     names = alone.free_names
@@ -209,7 +211,11 @@ def test_from_the_deflection_alone_a_linear_joint_has_four_numbers() -> None:
 
 
 def test_friction_at_the_hub_tells_the_torque_constant_to_the_deflection() -> None:
-    """Held, it would leave several times the noise, for which a search names effects that are not there."""
+    """With friction the torque constant is identifiable from the deflection alone.
+
+    If it is trusted at a wrong value, residuals are several times the noise, and a search would find effects
+    that do not exist.
+    """
     made = make_record([("coulomb", "hub")], kind="noise", seed=2, rms=2.0, seconds=6.0)
     angle = Recording(u=made["u"], y=made["y"][:, 1], Ts=made["Ts"], channels="alpha", accept=("units",))
     joint, constant = (
@@ -217,7 +223,7 @@ def test_friction_at_the_hub_tells_the_torque_constant_to_the_deflection() -> No
         "hub.motor.torque_constant",
     )
     true = made["truth"]["plant"]["k_t"]
-    assert abs(true / 0.00767 - 1) > 0.15  # what the preset says is wrong
+    assert abs(true / 0.00767 - 1) > 0.15  # the value of the preset is wrong
     found = fit(joint, angle)
     assert found.noise["alpha"] < 1.2 * np.hypot(JITTER, COUNT / np.sqrt(12))
     assert found[constant].value == pytest.approx(true, abs=4 * found[constant].std)

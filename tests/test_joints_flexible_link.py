@@ -1,4 +1,4 @@
-"""The flexible link against beam elements, its fit, and what a search tries on it."""
+"""The flexible link against beam elements, its fit, and the candidates of a search."""
 
 import numpy as np
 import pytest
@@ -16,9 +16,9 @@ Ts = 0.002
 
 
 def beam(elements: int = 30) -> tuple[np.ndarray, np.ndarray, float]:
-    """Mass and stiffness matrices of hub angle and bending by cubic elements, and the curvature's factor.
+    """Mass and stiffness matrices of hub angle and bending by cubic elements, and bending stiffness EI.
 
-    Unknowns: angle of the hub, then deflection and slope at each node but the clamp, against the hub.
+    Unknowns: angle of the hub, then deflection and slope at each node but the clamp, relative to the hub.
     """
     h, rho = LENGTH / elements, MASS / LENGTH
     EI = (2 * np.pi * FREQUENCY) ** 2 * rho * (LENGTH / 1.8751040687) ** 4
@@ -53,7 +53,7 @@ def beam(elements: int = 30) -> tuple[np.ndarray, np.ndarray, float]:
         part = slice(2 * e, 2 * e + 4)
         M[part, part] += m
         K[part, part] += k
-    # A turn of the hub moves every point by x and tilts it by one, which the elements hold exactly.
+    # A unit rotation of the hub moves each point by x with slope one; the elements represent it exactly.
     turn = np.column_stack([np.arange(elements + 1) * h, np.ones(elements + 1)]).ravel()
     T = np.column_stack([turn, np.eye(size)[:, 2:]])
     whole = T.T @ M @ T
@@ -64,30 +64,30 @@ def beam(elements: int = 30) -> tuple[np.ndarray, np.ndarray, float]:
 
 
 def test_modes_are_those_of_a_beam():
-    """Frequencies with the hub free, and the gauge's reading in each mode for a unit turn of the hub."""
+    """Frequencies with a free hub, and the gauge's reading in each mode for a unit rotation of the hub."""
     M, K, EI = beam()
     values, shapes = scipy.linalg.eigh(K, M)
-    # Curvature at the clamp: of the first element's cubic, from its free end.
+    # Curvature at the clamp from deflection and slope at the free end of the first element.
     h = LENGTH / 30
     curvature = (6 / h**2 * shapes[1] - 2 / h * shapes[2]) / shapes[0]
     machine = flexible_link(hub=HUB, damping_ratio=0.0, hub_damping=0.0, gauge_gain=1.0)
     machine = machine.with_values({"hub.motor.back_emf": 0.0})
     found, own = np.linalg.eig(linearise(machine).A)
-    # What the third mode and those above bend is left out.
+    # The model leaves out the curvature of the third mode and those above.
     for mode, tolerance, bent in ((1, 2e-4, 0.01), (2, 3e-3, 0.1)):
         expected = np.sqrt(values[mode])
         i = np.argmin(np.abs(found.imag - expected))
         assert found[i].imag == pytest.approx(expected, rel=tolerance)
         x = own[:3, i] / own[0, i]
         assert (x[1] + x[2]).real == pytest.approx(curvature[mode] * LENGTH / 4, rel=bent)
-    # A load at the tip acts on each mode by 4 / (beta L)^2, and the tip moves by as much with it.
+    # A load at the tip acts on each mode by 4 / (beta L)^2, and each mode moves the tip by this factor.
     springs = [machine.effect("spring", at).values["stiffness"] for at in ("joint", "second")]
     soft = sum((4 / b**2) ** 2 / k for b, k in zip((1.8751, 4.6941), springs, strict=True))
     assert soft == pytest.approx(LENGTH / (3 * EI), rel=0.006)
 
 
 def test_a_load_at_the_tip_reads_as_the_tips_angle():
-    """The gauge is calibrated by it: F L = EI curvature, deflection F L^3 / 3 EI."""
+    """A static load at the tip calibrates the gauge: F L = EI curvature, deflection F L^3 / 3 EI."""
     EI = beam()[2]
     force = 0.1
     curvature, tip = force * LENGTH / EI, force * LENGTH**3 / (3 * EI)

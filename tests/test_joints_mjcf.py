@@ -150,7 +150,7 @@ def test_the_machine_moves_as_in_mujoco(tmp_path, kind):
     ids=["tendon", "inductance", "weight, lag, limit", "two levels", "servo", "slide"],
 )
 def test_an_exported_machine_comes_back(tmp_path, monkeypatch, machine, size):
-    monkeypatch.setitem(sys.modules, "mujoco", None)  # neither needs it
+    monkeypatch.setitem(sys.modules, "mujoco", None)  # neither export nor import needs it
     to_mjcf(machine, Ts).save(tmp_path / "m.xml")
     back = rf.load_mjcf(tmp_path / "m.xml", *machine.coordinates)
     assert back.units[:2] == machine.units[:2] and back.units.input == machine.units.input
@@ -268,7 +268,7 @@ def test_what_cannot_be_said_is_refused_by_name(tmp_path, change, words, ignore)
 
 @pytest.mark.parametrize("zero", ['mass="1" pos="0.1', 'mass="1" pos="0 0', "0.01 0.01 0.01"])
 def test_what_moves_has_mass_and_inertia(tmp_path, zero):
-    """As in MuJoCo, which refuses bodies that any torque would move at once."""
+    """Moving bodies without mass or inertia are refused, as in MuJoCo."""
     mujoco = pytest.importorskip("mujoco")
     text = TWO.format(**PLAIN).replace(zero, zero.replace("1", "0"))
     with pytest.raises(ValueError, match="mass and inertia of moving bodies"):
@@ -328,7 +328,7 @@ def test_files_of_others_are_read_safely(tmp_path, text, words):
 
 
 def test_damaged_files_end_in_one_sentence(tmp_path):
-    """Whatever stands in an attribute or is lost on the way: a machine, or an InputError."""
+    """A file with a random attribute or a missing part gives a mechanism, or an InputError in one line."""
     rng = np.random.default_rng(5)
     whole = SHAPES.format(actuator=ACTUATORS["general"][0], sequence="xyz")
     attributes = [m.span(1) for m in re.finditer(r'="([^"]*)"', whole)]

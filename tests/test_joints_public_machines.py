@@ -1,4 +1,4 @@
-"""Machines that move in metres or volts, a smooth input, and the official protocols."""
+"""Machines that move in metres or volts, a smooth input, and the protocols of public benchmarks."""
 
 import dataclasses
 import re
@@ -55,7 +55,7 @@ def test_a_linear_axis_is_searched_for_what_a_line_can_have():
     assert "viscous_asymmetric" not in {cls.name for cls, _ in search_places(rf.joints.paper())}
     box = {(cls.name, place) for cls, place in search_places(rf.joints.silverbox())}
     assert ("cubic_spring", "joint") in box
-    # A gain of the only sensor is a unit; of two sensors it is a finding.
+    # With one sensor its gain is only a matter of units; with two sensors a gain error is a candidate.
     assert ("sensor_gain", "output") not in box
     assert ("sensor_gain", "alpha") in {(c.name, p) for c, p in search_places(rf.joints.paper())}
 
@@ -106,7 +106,7 @@ def test_what_is_smoothed_is_linear_and_keeps_a_constant():
 
 
 def test_noise_under_fast_motion():
-    """A motion of nine samples a period is no noise."""
+    """A motion with a period of nine samples does not count as noise of the sensor."""
     rng, k = np.random.default_rng(0), np.arange(6000)
     y = 0.05 * np.sin(2 * np.pi * k / 9.1) + 3e-4 * rng.normal(size=6000)
     run = Recording(u=np.sin(k), y=y, Ts=1 / 610, channels="output", units="V")
@@ -114,9 +114,9 @@ def test_noise_under_fast_motion():
 
 
 def test_first_states_held_where_a_drift_would_move_them():
-    """An axis pushed by a force that the model lacks: a free first position takes part of the blame.
+    """An axis with a force that the model lacks: a fitted first position hides a part of the error.
 
-    A fit that holds the first state promises the error that a free run by the protocol has.
+    With measured first states, the residuals of the fit are those of a free run by the benchmark's protocol.
     """
     rng, Ts, mass, c = np.random.default_rng(1), 0.01, 90.0, 200.0
     u = np.repeat(rng.choice([-1.0, 1.0], 40), 50)
@@ -161,7 +161,7 @@ def test_a_score_counts_what_follows_the_first_samples_in_the_unit_of_the_benchm
 
 
 def test_emps_with_published_constants_scores_as_an_explicit_simulation(measured: Measured):
-    """8.56 mm and 5.46 mm come from an explicit Euler simulation of the published equation, 1 ms steps."""
+    """Reference: 8.56 and 5.46 mm of an explicit Euler simulation of the published equation, 1 ms steps."""
     measured("emps")
     emps = benchmark("emps")
     constants = {c.parameter: c.value for c in emps.constants}
@@ -173,7 +173,7 @@ def test_emps_with_published_constants_scores_as_an_explicit_simulation(measured
 
 
 def test_silverbox_with_one_cubic_spring_scores_as_an_explicit_simulation(measured: Measured):
-    """0.353, 0.451 and 0.351 mV come from a Runge-Kutta simulation on an input interpolated 8 times."""
+    """Reference: 0.353, 0.451 and 0.351 mV of a Runge-Kutta simulation on an input interpolated 8 times."""
     measured("silverbox")
     gain = 0.9301 * 2e5
     box = (

@@ -65,7 +65,7 @@ class Triangle:
 
 
 def fitted(basis, w: np.ndarray, covariance: np.ndarray | None = None) -> SimpleNamespace:
-    """What an identification ends in: a series, or a fit of one with the covariance of its weights."""
+    """The result of an identification: a series, or a fit of one with the covariance of its weights."""
     units = {"input_unit": "V", "output_unit": "rad"}
     series = SimpleNamespace(basis=basis, weights=w, channel="alpha", Ts=Ts, **units)
     return series if covariance is None else SimpleNamespace(model=series, covariance=covariance)
@@ -96,7 +96,7 @@ def test_linear_joint_has_its_impulse_response_and_nothing_else(period: str) -> 
 def second_order(k2: float, u: np.ndarray) -> float:
     """Second-order part of the deflection one sample after `u`, from the equation of the perturbation.
 
-    x1' = A x1 + B u and x2' = A x2 - b k2 (p x1)^2; with z = x1 (x) x1 the three are linear under a held u.
+    x1' = A x1 + B u and x2' = A x2 - b k2 (p x1)^2; with z = x1 (x) x1 all are linear under a constant u.
     """
     A, B = np.array(NUMBERS["A4"]), np.array(NUMBERS["B4"])
     hub, arm = 0.0021, 0.0059
@@ -130,7 +130,7 @@ def test_quadratic_spring_has_the_kernel_of_its_second_order_perturbation() -> N
 
 def test_remainder_of_the_series_is_of_third_order() -> None:
     m = model(SPRING, fx.CubicSpring("joint", stiffness=20.0), OFFSET, substeps=1)
-    memory = 24  # more than the joint remembers, or the offset's own transient would count
+    memory = 24  # longer than the impulse response, or the transient of the offset would count
     level = 0.5
     kernels = local_kernels(m, Ts, "alpha", memory, voltage=level, settle=4.0)
     shape = np.random.default_rng(0).normal(size=10)
@@ -199,10 +199,13 @@ def coloured(seed: int, a: float = 0.6) -> np.ndarray:
 
 @pytest.mark.parametrize("draw", [white, coloured])
 def test_dead_zone_scales_the_linear_kernel_and_squares_on_the_diagonal(draw) -> None:
-    """f(u) has the best line E f' and the best square E f''/2, whatever the colour (Bussgang, Price)."""
+    """The best linear factor of f(u) is E f', and the best quadratic one is E f''/2.
+
+    This holds for a Gaussian u of any spectrum (theorems of Bussgang and Price).
+    """
     up, down = 0.6, 0.2
     zone = fx.DeadZone(positive=up, negative=down)
-    memory = 20  # one second: the deflection has forgotten, so nothing leans on the last lags
+    memory = 20  # one second, after which the impulse response of the deflection has decayed
     kernels = average_kernels(model(zone, substeps=1), draw(2), "alpha", memory, Ts=Ts)
     linear = local_kernels(paper(), Ts, "alpha", memory).h1
     open_share = norm.sf(up) + norm.sf(down)
@@ -211,7 +214,7 @@ def test_dead_zone_scales_the_linear_kernel_and_squares_on_the_diagonal(draw) ->
         (kernels.h1, open_share * linear, kernels.errors[0]),
         (kernels.h2, np.diag(curvature * linear), kernels.errors[1]),
     ):
-        # Stretches that are all alike have no scatter to speak of.
+        # A lower limit for standard errors that are almost zero.
         z = np.abs(found - expected) / np.maximum(std, 2e-5)
         assert np.max(z) < 4.0
     assert abs(kernels.h2[1, 1]) > 5 * kernels.errors[1][1, 1]
@@ -230,7 +233,7 @@ def test_least_squares_finds_the_average_kernels(case: str) -> None:
     m, u = model(*CASES[case]), white(3)
     kernels = average_kernels(m, u, "alpha", MEMORY, Ts=Ts)
     agreement = kernels.against(by_numpy(u, alpha(m, u)))
-    assert agreement.rms[0] < 2.5  # a dead zone scales all lags alike: one chance, not six
+    assert agreement.rms[0] < 2.5  # a dead zone scales all lags alike: one random error, not six
     assert 0.6 < agreement.rms[1] < 1.5
     quadratic = kernels.against(average_kernels(paper(), u, "alpha", MEMORY, Ts=Ts)).rms[1]
     if case in ("dead zone", "friction"):
@@ -262,7 +265,7 @@ def test_least_squares_finds_them_under_a_coloured_input_and_a_short_memory() ->
     agreement = kernels.against(by_numpy(u, alpha(m, u), memory, reach))
     assert agreement.rms[0] < 1.5
     assert agreement.rms[1] < 1.5
-    # Slopes at later lags lean on these: leaving them out is seen.
+    # The input correlates later lags with these, so leaving later lags out changes the kernel.
     without = average_kernels(m, u, "alpha", memory, Ts=Ts, reach=memory)
     assert np.max(np.abs(without.h1 - kernels.h1)) > 10 * np.max(kernels.errors[0])
 
@@ -322,7 +325,7 @@ def test_what_odd_effects_do_to_an_odd_joint() -> None:
 def test_offset_makes_friction_even() -> None:
     before = len(output_derivatives)
     table = effect_kernels(model(HUB, OFFSET), white(10), "alpha", MEMORY, Ts=Ts)
-    # One compilation for the kernels with and without each effect (none where a test above had it).
+    # One compilation for the kernels with and without each effect (none if an earlier test compiled it).
     assert len(output_derivatives) - before <= 1
     friction, offset = table.shares
     without = average_kernels(model(HUB), white(10), "alpha", MEMORY, Ts=Ts)
@@ -332,7 +335,7 @@ def test_offset_makes_friction_even() -> None:
     assert friction.quadratic > 0.01
     assert offset.quadratic > 0.01
     assert "%" in str(offset)
-    # Without friction an offset of the voltage is invisible in the deflection.
+    # Without friction an offset of the voltage has no effect on the deflection.
     alone = effect_kernels(model(OFFSET), white(10), "alpha", MEMORY, Ts=Ts).shares[0]
     assert alone.linear == alone.quadratic == 0.0
     assert json.loads(json.dumps(table.to_dict()))["effects"][1]["effect"] == "voltage_offset"
@@ -366,7 +369,7 @@ def some() -> Kernels:
 def test_series_is_the_same_about_any_level() -> None:
     kernels, u = some(), np.random.default_rng(13).normal(size=50)
     moved = kernels.moved(0.7)
-    # From sample 3 on, when both look at the same past.
+    # From sample 3 on, where both use the same past samples.
     np.testing.assert_allclose(moved.response(u)[3:], kernels.response(u)[3:], atol=1e-12)
     np.testing.assert_allclose(moved.moved(0.0).h1, kernels.h1, atol=1e-12)
     by_hand = [
@@ -405,7 +408,7 @@ def test_weights_of_a_basis_with_the_plants_poles_are_its_impulse_response() -> 
 
 
 def test_a_cubic_degree_is_counted_by_its_best_line() -> None:
-    """Least squares with and without the cubes finds one linear kernel, of an odd plant with memory."""
+    """Least squares with and without cubic terms gives the same linear kernel of an odd plant with memory."""
     m, u = model(HUB, fx.DeadZone(positive=0.4, negative=0.4)), coloured(20)
     y, found = alpha(m, u), []
     for degrees in ((1,), (1, 3)):

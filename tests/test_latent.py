@@ -39,7 +39,7 @@ TRUE = {"hub_damping": 0.004, "joint_damping": 0.003}
 
 
 def recorded(effects=(), seed: int = 101, seconds: float = 8.0, **named) -> tuple[Recording, dict]:
-    """A joint with the paper's numbers exactly, and something hidden."""
+    """A joint with exactly the paper's parameters, and hidden effects."""
     r = make_record(effects, seed=seed, seconds=seconds, fs=250.0, perturb=0.0, rms=1.5, **named)
     return Recording(u=r["u"], y=r["y"], Ts=r["Ts"], accept=("units",)), r
 
@@ -48,7 +48,7 @@ def recorded(effects=(), seed: int = 101, seconds: float = 8.0, **named) -> tupl
 
 
 def time_varying_model(N: int = 40, m: int = 4, C: int = 2):
-    """A time-varying model whose last state alone is disturbed, as in the use it is made for."""
+    """A time-varying model with process noise on its last state alone, as where a torque is estimated."""
     rng = np.random.default_rng(5)
     A = np.eye(m) + 0.1 * rng.normal(size=(N, m, m))
     H, seen = rng.normal(size=(N, C, m)), (rng.random(N) > 0.2).astype(float)
@@ -62,7 +62,7 @@ def time_varying_model(N: int = 40, m: int = 4, C: int = 2):
 
 
 def textbook(model: LinearTimeVaryingModel, start: InitialDistribution, noise: np.ndarray, Q: np.ndarray):
-    """Rauch, Tung and Striebel, with all channels of an innovation at once and with inverses."""
+    """Smoother of Rauch, Tung and Striebel, with inverses and all channels of an innovation at once."""
     m, P, R = start.mean, np.diag(start.variance), np.diag(noise**2)
     prior, after, total = [], [], 0.0
     for A, c, H, y, seen in zip(*model, strict=True):
@@ -96,7 +96,7 @@ def test_the_smoother_is_that_of_rauch_tung_and_striebel():
 
 
 def test_without_process_noise_it_is_least_squares():
-    """The textbook's inverse does not exist there; the first state is a plain regression."""
+    """The inverse of the textbook does not exist in this case; reference: regression of the first state."""
     model, start, noise, Q = time_varying_model(N=12)
     rows, targets, move, shift = [], [], np.eye(4), np.zeros(4)
     for A, c, H, y, seen in zip(*model, strict=True):
@@ -145,7 +145,7 @@ def test_a_linear_joint_keeps_its_state_space_under_a_held_torque():
         np.testing.assert_allclose(found.c[k], np.r_[Bd * u[k], 0, 0], atol=1e-10)
         np.testing.assert_allclose(found.A[k, 4:], np.c_[np.zeros((2, 4)), 0.9 * np.eye(2)], atol=1e-12)
         np.testing.assert_allclose(found.H[k], np.c_[ss.C, np.zeros((2, 2))], atol=1e-12)
-    # A held torque, by an integrator of its own.
+    # Response to a constant torque, by scipy's integrator.
     J, Ja = 0.0021, 0.0059
     M = np.array([[J + Ja, Ja], [Ja, Ja]])
     for column, push in ((4, [1.0, 0.0]), (5, [0.0, 1.0])):
@@ -172,7 +172,7 @@ def test_the_linear_model_is_tangent_to_a_nonlinear_mechanism():
 
 
 def test_the_intensity_is_that_of_scipy():
-    """One inertia under a random walk of known intensity; the optimum by another optimiser."""
+    """One inertia under a random-walk torque of known intensity, against the optimum of Nelder and Mead."""
     m, Ts, N = single_inertia(inertia=0.01, damping=0.02), 0.01, 500
     rng = np.random.default_rng(3)
     u, d, x, rows = rng.normal(size=N), 0.0, np.zeros(2), []
@@ -238,7 +238,7 @@ def test_what_a_damper_took_over_can_be_given_back():
     back = bent.given_back("hub.viscous")
     assert np.std((back.torque[:, 0] - whole)[sliding]) < 0.3 * 0.03
     assert np.std((bent.torque[:, 0] - whole)[sliding]) > 0.4 * 0.03
-    # Beyond the true damper it is the friction alone.
+    # Relative to the model with the true damper, it is the friction alone.
     alone = bent.given_back(beyond=true)
     assert np.std((alone.torque[:, 0] + 0.03 * np.sign(speed))[sliding]) < 0.3 * 0.03
     np.testing.assert_array_equal(back.given_back("hub.viscous").torque, back.torque)
@@ -253,7 +253,7 @@ def test_once_the_effect_is_in_the_model_nothing_is_left():
     assert before.size("hub") > 0.015 and before.size("joint") > 0.01
     assert after.size("hub") < 0.02 * before.size("hub")
     assert after.size("joint") < 0.02 * before.size("joint")
-    # The hardening spring, over the deflection.
+    # The torque of the hardening spring over the deflection.
     curve = before.curve("joint", "deflection", 16)
     truth = -60.0 * curve.at**3
     np.testing.assert_allclose(curve.mean, truth, atol=0.1 * np.abs(truth).max())
@@ -285,7 +285,10 @@ def test_other_parameters_need_no_compilation():
 
 
 def test_a_stay_in_a_bin_counts_once():
-    """Means of stays are independent here, samples within a stay are not: the band is that of the stays."""
+    """Samples within a stay are dependent, the means of stays are independent.
+
+    The 95 % band of each bin follows from the stays, and misses the true mean in 1 to 10 % of the cases.
+    """
     rng = np.random.default_rng(7)
     misses = []
     for _ in range(200):

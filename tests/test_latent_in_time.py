@@ -1,4 +1,4 @@
-"""Latent torques read in time: lines and drifts that are there, and none where there are none."""
+"""Sinusoids and drifts in latent torques: found where they exist, and not found where they do not."""
 
 import dataclasses
 
@@ -17,13 +17,13 @@ T = Ts * np.arange(N)
 
 
 def coloured(rng: np.random.Generator, memory: float = 0.98) -> np.ndarray:
-    """A torque without lines, of standard deviation one, slower than the sampling."""
+    """A torque without spectral lines, of standard deviation one: low-pass filtered white noise."""
     x = scipy.signal.lfilter([1.0], [1.0, -memory], rng.standard_normal(N + 500))[500:]
     return x / x.std()
 
 
 def dry_friction(u: np.ndarray) -> np.ndarray:
-    """A torque of the motion, with whatever lines that has."""
+    """A friction torque; it has the spectral lines of the motion."""
     return -np.sign(scipy.signal.lfilter([1.0], [1.0, -0.99], u))
 
 
@@ -33,7 +33,7 @@ def test_a_sine_is_found_with_frequency_and_amplitude(seed: int, amplitude: floa
     rng = np.random.default_rng(seed)
     x = coloured(rng) + amplitude * np.sin(2 * np.pi * frequency * T + rng.uniform(0, 6))
     (line,) = periodic_torques(x, excitation.noise(N, Ts, seed=seed), Ts)
-    # The variance of the frequency is 6 / (pi^2 T^2 N signal-to-noise): far below a step of the spectrum.
+    # The frequency has the variance 6 / (pi^2 T^2 N signal-to-noise), its root far below 1 / T.
     assert line.frequency == pytest.approx(frequency, abs=0.5 / (N * Ts))
     low, high = line.interval
     assert low < line.amplitude < high and high - low < 2 * amplitude
@@ -69,7 +69,7 @@ def test_torques_of_the_motion_are_no_disturbance(kind: str) -> None:
 
 
 def test_an_input_that_repeats_itself_makes_lines_of_its_own() -> None:
-    """Friction under a periodic input has its multiples, also those that the input lacks."""
+    """Friction under a periodic input has lines at all multiples of its frequency; they are not reported."""
     u = np.tile(excitation.multisine(N // 8, Ts, seed=3), 8)
     x = dry_friction(u) + 0.3 * np.sin(2 * np.pi * 13.3 * T) + 0.05 * coloured(np.random.default_rng(3))
     lines = periodic_torques(x, u, Ts)
@@ -97,7 +97,7 @@ def test_a_drift_has_its_slope() -> None:
 
 
 def test_a_shaken_arm_is_read_from_a_recording() -> None:
-    """A sine at the arm that nobody measures, from an independent simulator."""
+    """An unmeasured sinusoidal torque at the arm, from the independent simulator."""
     shaken = {("shaking", "arm"): {"amplitude": 0.02, "frequency": 1.7}}
     made = make_record(shaken, seed=5, seconds=10.0, fs=200.0, perturb=0.0)
     recording = rf.Recording(u=made["u"], y=made["y"], Ts=made["Ts"])
@@ -105,12 +105,12 @@ def test_a_shaken_arm_is_read_from_a_recording() -> None:
     found = rf.latent_torque(joint, recording, ports=["arm", "hub"])
     line = found.periodic("arm")[0]
     assert line.frequency == pytest.approx(1.7, abs=0.02)
-    assert line.amplitude == pytest.approx(0.02, rel=0.3)  # the plant's damping is another one
+    assert line.amplitude == pytest.approx(0.02, rel=0.3)
     assert any("1.7 Hz" in sentence and "arm" in sentence for sentence in found.in_time())
     assert "1.7 Hz" in str(found) and "1.7 Hz" in found._repr_html_()
     labels = [text.get_text() for ax in rf_time_axes(found) for text in ax.texts]
     assert "1.7 Hz" in labels
-    # A torque that the data do not ask for is not read at all.
+    # A torque by which the likelihood gains too little is not analysed.
     silent = dataclasses.replace(found, gain_nats=dict.fromkeys(found.ports, ASKED_FOR - 1))
     assert silent.in_time() == []
 

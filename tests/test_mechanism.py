@@ -1,4 +1,4 @@
-"""Mechanisms: what they refuse, what adding and removing does, and that numbers never recompile."""
+"""Mechanisms: refused arguments, adding and removing of effects, and no new program for other values."""
 
 import dataclasses
 from typing import ClassVar
@@ -71,10 +71,10 @@ def test_what_is_added_can_be_taken_away():
     more = joint + fx.Coulomb("hub", level=0.03)
     assert more.parameter_names == (*joint.parameter_names, "hub.coulomb.level")
     assert "hub.coulomb.level" in more.free_names
-    assert joint.parameter_names == paper().parameter_names  # the old one stays as it was
+    assert joint.parameter_names == paper().parameter_names  # the original is unchanged
     assert more.without("coulomb", "hub") == joint
     held = more.trust("hub.coulomb.level")
-    assert held.without("coulomb", "hub") == joint  # what is gone is trusted no more
+    assert held.without("coulomb", "hub") == joint  # a removed parameter is no longer trusted
     assert held.release("hub.coulomb.level") == more
     with pytest.raises(TypeError):
         joint + 1.0
@@ -98,7 +98,7 @@ def test_values_by_name_and_as_a_vector():
     named = joint.with_values({"joint.spring.stiffness": 2.0})
     assert named == joint.with_values(vector)
     assert named.effect("spring", "joint").stiffness == 2.0
-    # An independent reading of the number: it stands in the equations of motion.
+    # Independent check: the stiffness in the equations of motion.
     M = np.array([[0.0021 + 0.0059, 0.0059], [0.0059, 0.0059]])
     np.testing.assert_allclose(linearise(named).A[2:, 1], np.linalg.solve(M, [0.0, -2.0]))
 
@@ -150,7 +150,7 @@ TRACED: list[str] = []
 
 @dataclasses.dataclass(frozen=True)
 class Counting(fx.Force):
-    """A damper that notes each time it is traced."""
+    """A damper that records each time it is traced."""
 
     name: ClassVar[str] = "counting"
     title: ClassVar[str] = "a damper that counts"
@@ -175,7 +175,7 @@ def test_a_new_number_does_not_trace_again():
     assert len(TRACED) == traced
     assert np.abs(second - first).max() > 1e-3
     simulate(joint + fx.Viscous("arm", coefficient=0.001), u, 0.01)
-    assert len(TRACED) > traced  # a new structure does, so the count works
+    assert len(TRACED) > traced  # a new structure is traced, so the count works
 
 
 def test_a_second_fit_does_not_trace_again():

@@ -1,4 +1,4 @@
-"""Play with elastic teeth: closed forms, scipy's solver, the rigid limit, friction beside it, derivatives."""
+"""Play with elastic teeth: closed forms, scipy's solver, the rigid limit, added friction, derivatives."""
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +19,7 @@ from rotflex_jax.runtime.xla import double_precision
 
 Ts, GAP, SHARE, STIFFNESS, DAMPING = 0.002, 0.0055, 0.7, 1500.0, 0.3
 J, EMF, RESISTANCE = 0.0021, 0.00767 * 70, 2.6
-REDUCED = SHARE * (1 - SHARE) * J  # what the teeth of a free hub swing with
+REDUCED = SHARE * (1 - SHARE) * J  # reduced inertia of rotor and hub
 
 
 def elastic(**numbers: float) -> fx.ElasticBacklash:
@@ -37,7 +37,7 @@ def noise(N: int, hold: int = 10, seed: int = 2) -> np.ndarray:
 
 
 def by_scipy(u, hold, Ts=Ts, gap=GAP, share=SHARE, stiffness=STIFFNESS, damping=DAMPING, **more):
-    """Hub, deflection and rotor against the hub; short steps, so that no contact is missed."""
+    """Hub, deflection and rotor relative to the hub, by scipy in steps so short that no contact is missed."""
     J_r, J_h, J_a, K = share * J, (1 - share) * J, 0.0059, 1.61
     level, L = more.get("level", 0.0), more.get("inductance")
 
@@ -86,7 +86,7 @@ def test_a_free_oscillator_against_the_matrix_exponential(loss):
 @pytest.mark.parametrize("start", [0.0, 0.37])
 @pytest.mark.parametrize(("stiff", "loss"), [(0.8, 0.1), (30.0, 2.0), (400.0, 1.0), (5.0, 30.0)])
 def test_moments_of_a_contact_against_quadrature(stiff, loss, start):
-    """The flight passes the stop at `start` outwards, or begins with some depth."""
+    """The free motion passes the stop outwards at time `start`, or begins in contact."""
     depth = 0.2 if start == 0 else 0.0
     slope = np.array([0.8, -1.1, 0.5])
     a = depth - sum(c * start ** (i + 1) for i, c in enumerate(slope))
@@ -125,18 +125,18 @@ def test_an_undamped_impact_returns_all_energy():
     np.testing.assert_allclose(states[after, 3], -relative, rtol=1e-9)
     np.testing.assert_allclose(states[after, 1], share * relative, rtol=1e-9)
     np.testing.assert_allclose(states[after, 2], GAP - relative * (t[after] - parts), atol=1e-12)
-    # Their common centre does not move at all.
+    # Their centre of mass does not move.
     np.testing.assert_allclose(states[:, 0] + share * states[:, 2], 0.0, atol=1e-12)
 
 
 def test_teeth_under_load_bend_and_never_pull():
-    """A constant torque holds them together by the rotor's share of the acceleration of the whole."""
+    """Under a constant torque the teeth transmit the hub's share of it, and they never pull."""
     volts, machine = 0.8, single_inertia(J, motor=fx.Motor(back_emf=0.0)) + elastic(damping=2.0)
     states = simulate_states(machine, np.full(300, volts), Ts)
     torque = EMF / RESISTANCE * volts
     np.testing.assert_allclose(states[100:, 2], GAP + (1 - SHARE) * torque / STIFFNESS, rtol=1e-7)
     np.testing.assert_allclose(np.diff(states[100:, 1]) / Ts, torque / J, rtol=1e-9)
-    # Released, the rotor leaves with what the teeth gave back, and the hub is never slowed down.
+    # When the torque ends, the teeth push rotor and hub apart, and the hub is never slowed down.
     speeds = simulate_states(machine, np.r_[np.full(100, volts), np.zeros(20)], Ts)[100:, 1]
     assert np.diff(speeds).min() > -1e-12
 
@@ -182,7 +182,7 @@ def test_rigid_teeth_are_the_limit():
     rigid = simulate(plain() + fx.Backlash("hub", gap=GAP, share=SHARE), u, Ts, solver=fine)
     away = []
     for stiffness in (3e3, 1e5, 3e6):
-        # Without a rebound, as rigid teeth meet.
+        # With damping that prevents a rebound, as with rigid teeth.
         teeth = elastic(stiffness=stiffness, damping=40 * np.sqrt(stiffness * REDUCED))
         away.append(np.abs(simulate(plain() + teeth, u, Ts, solver=fine) - rigid).max())
     assert away[1] < away[0] / 4 and away[2] < away[1] / 2 and away[2] < 2e-5
@@ -190,7 +190,7 @@ def test_rigid_teeth_are_the_limit():
 
 @pytest.mark.parametrize("damping", [0.0, 0.3, 30.0])
 def test_any_stiffness_is_stable(damping):
-    """With friction that holds the hub, a motor that reverses, and one step of 2 ms."""
+    """Runs stay bounded with friction that holds the hub, a motor that reverses, and one step of 2 ms."""
     u = 2 * noise(2000)
     for stiffness in (1.0, 1500.0, 1e5, 1e8):
         machine = plain() + fx.Coulomb("hub", 0.03) + elastic(stiffness=stiffness, damping=damping)

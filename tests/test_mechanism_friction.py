@@ -1,4 +1,4 @@
-"""Dry friction over one step against motion from event to event, and against all modes in turn."""
+"""Dry friction over one step, against motion from event to event and a search over all modes."""
 
 import functools
 import itertools
@@ -30,7 +30,10 @@ def run(function: Callable[..., Any], *arguments: Any) -> Any:
 
 
 def draws(rng: np.random.Generator, k: int) -> tuple[np.ndarray, ...]:
-    """Speeds at the start and at the end without friction, and levels, (k, CASES); some of each are zero."""
+    """Speeds at the start, speeds at the end without friction, levels, (k, CASES).
+
+    Some speeds at the start and some levels are zero.
+    """
     v0, free = rng.normal(size=(2, k, CASES))
     up, down = rng.uniform(0.1, 1.0, size=(2, k, CASES))
     v0[rng.random(v0.shape) < 0.3] = 0.0
@@ -40,7 +43,7 @@ def draws(rng: np.random.Generator, k: int) -> tuple[np.ndarray, ...]:
 
 
 def moved(v0: float, free: float, stop: float, up: float, down: float) -> tuple[float, float | None, bool]:
-    """Speed after a step of length one under a constant drive, when it first was zero, whether it rests."""
+    """Speed after a step of length one under a constant drive, time of its first zero, whether it rests."""
     push = free - v0
     if v0 != 0:
         way = np.sign(v0)
@@ -72,7 +75,7 @@ def test_a_contact_alone_moves_from_event_to_event() -> None:
         if begun is None or mean == 0:
             assert found.holds[n] == 0
         else:
-            # One at rest; from one level to two of the mean it falls to zero.
+            # 1 at rest; it decreases to zero while the drive exceeds the level by up to one mean level.
             over = (abs(drive) - (up[n] if drive > 0 else down[n])) / mean
             assert found.holds[n] == pytest.approx(np.clip(1 - over, 0, 1), abs=1e-12)
         rests += held
@@ -80,7 +83,7 @@ def test_a_contact_alone_moves_from_event_to_event() -> None:
 
 
 def test_a_contact_at_rest_without_a_drive_has_derivatives() -> None:
-    """It holds against what little drives it: the torque is less that over the mobility."""
+    """At rest, friction cancels a small drive: its torque is `-free / stop`, the levels do not matter."""
 
     def torque(v0, free, stop, up, down):
         return independent_contacts(v0, free, stop, up, down).torque
@@ -91,7 +94,7 @@ def test_a_contact_at_rest_without_a_drive_has_derivatives() -> None:
 
 @pytest.mark.parametrize("side", [0.999, 1.001])
 def test_a_speed_is_zero_to_64_units_of_rounding(side: float) -> None:
-    """Of the speeds that drive and friction give it in a step."""
+    """The rounding is that of the speeds that drive and friction cause in a step."""
     free, stop, up, down = -2.0, 3.0, 0.4, 0.7
     v0 = side * 64 * np.finfo(float).eps * (2.0 + 3.0 * 1.1)
     for sign in (1, -1):
@@ -107,7 +110,7 @@ def test_torques_are_limited_to_their_levels_with_whole_derivatives() -> None:
 
 
 def positive_definite(rng: np.random.Generator, k: int, rank: int) -> np.ndarray:
-    """Speeds of k contacts by torques at each, of a mechanism with that many coordinates."""
+    """Speeds of k contacts caused by a torque at each; the mechanism has `rank` coordinates."""
     ports = rng.normal(size=(k, rank))
     return ports @ ports.T + (0.3 * np.eye(k) if rank >= k else 0)
 
@@ -131,7 +134,7 @@ def test_masked_rows_are_solved_and_others_kept(k: int, many: bool) -> None:
 
 @pytest.mark.parametrize("size", [1e-6, 1.0, 1e6])
 def test_contacts_that_share_one_motion_share_the_torque(size: float) -> None:
-    """The ridge of 1e-10 of the largest entry: the solution of least norm, to the rounding it amplifies."""
+    """A ridge of 1e-10 of the largest entry gives the solution of least norm, up to amplified rounding."""
     matrix, mask = np.full((2, 2), 3.0 * size), np.ones((2, 1), bool)
     found = run(solve_masked, matrix, mask, np.full((2, 1), 6.0 * size), np.zeros((2, 1)))
     np.testing.assert_allclose(found, 1.0, rtol=1e-4)
@@ -161,7 +164,8 @@ def ends_by_modes(
 def test_coupled_contacts_take_the_one_mode_that_fits(k: int, missed: float) -> None:
     """Each is at rest, or so fast that it keeps its direction; some of those at rest break away.
 
-    Of three that break away together one may be let go that the others would have held again.
+    If three break away together, one may be released although the friction of the others would hold it. This
+    happens in at most 2 % of the cases.
     """
     rng = np.random.default_rng(11 * k)
     stop = positive_definite(rng, k, k)
@@ -185,7 +189,7 @@ def test_coupled_contacts_take_the_one_mode_that_fits(k: int, missed: float) -> 
 
 
 def test_a_single_pass_lets_no_contact_go() -> None:
-    """Torques that would hold all, each limited to its level."""
+    """The result is the torques that would hold all contacts, each limited to its level."""
     rng = np.random.default_rng(7)
     stop, free = positive_definite(rng, 2, 2), rng.normal(size=(2, CASES))
     up, down = rng.uniform(0.2, 1.5, size=(2, 2, CASES))
@@ -195,7 +199,7 @@ def test_a_single_pass_lets_no_contact_go() -> None:
 
 
 def test_three_contacts_on_two_coordinates_rest_together() -> None:
-    """Two of them hold the third; torques are not unique, speeds and levels are."""
+    """The torques are not unique, but all speeds are zero and all torques are within their levels."""
     rng = np.random.default_rng(5)
     stop = positive_definite(rng, 3, 2)
     free = stop @ rng.uniform(-0.3, 0.3, (3, CASES))
@@ -207,7 +211,7 @@ def test_three_contacts_on_two_coordinates_rest_together() -> None:
 
 
 def test_contacts_that_do_not_touch_are_as_if_alone() -> None:
-    """Whatever they do in the step: slide, stop, break away, turn round."""
+    """They slide, stop, break away or reverse in the step."""
     rng = np.random.default_rng(6)
     v0, free, up, down = draws(rng, 3)
     own = rng.uniform(0.2, 3.0, 3)
@@ -219,7 +223,7 @@ def test_contacts_that_do_not_touch_are_as_if_alone() -> None:
 
 @pytest.mark.parametrize("k", [1, 2, 3])
 def test_contacts_that_all_slide_need_no_elimination(k: int) -> None:
-    """Where contacts are said to slide, the full law gives the same torques, and nothing stops."""
+    """Where `all_slide` holds, the full law gives the same torques, and no contact stops."""
     rng = np.random.default_rng(10 + k)
     v0, _, up, down = draws(rng, k)
     free, up, down = v0 + 0.3 * rng.normal(size=v0.shape), 0.3 * up, 0.3 * down
@@ -231,7 +235,7 @@ def test_contacts_that_all_slide_need_no_elimination(k: int) -> None:
     assert 0.02 < np.mean(slide) < 0.7
     np.testing.assert_allclose(found.torque[:, slide], torque[:, slide], rtol=1e-14)
     assert not found.crossed[:, slide].any()
-    # And all that keep their direction in the full law, each by itself too, are found.
+    # Conversely, `all_slide` holds where all contacts keep their direction in the full law and each alone.
     together, alone = free + stop @ found.torque, free + np.diag(stop)[:, None] * torque
     keeps = np.all((v0 * together > 0) & (v0 * alone > 0) & ~found.crossed, axis=0)
     assert slide[keeps].all()

@@ -1,4 +1,4 @@
-"""Play in the gear: closed forms, an event-driven solver, the arena's gear, and the score of a search."""
+"""Play in the gear: closed forms, an event-driven solver, the arena's gear, and the score test."""
 
 import dataclasses
 import sys
@@ -38,11 +38,11 @@ from rotflex_jax.runtime.xla import double_precision
 PLACE, NOISE = EffectLocation("backlash", "hub"), np.array([5.4e-4, 5.4e-4])
 Ts, GAP, SHARE = 0.002, 0.0055, 0.7
 J, EMF, RESISTANCE = 0.002, 0.00767 * 70, 2.6
-GAIN = EMF / RESISTANCE  # torque per volt, and with EMF the loss per speed
+GAIN = EMF / RESISTANCE  # torque per volt; times EMF, the torque lost per speed
 
 
 def lone(**numbers: float) -> Mechanism:
-    """A hub with nothing but a motor without losses."""
+    """A hub with play and a motor without losses."""
     return single_inertia(J, motor=fx.Motor(back_emf=0.0)) + fx.Backlash("hub", **numbers)
 
 
@@ -51,7 +51,10 @@ def joint(gap: float = GAP, share: float = SHARE, **parts: float) -> Mechanism:
 
 
 def test_each_way_through_a_step_is_in_the_program_once(monkeypatch):
-    """In flight, in contact, and where that changes: programs with play take long to compile."""
+    """Three times in all: in flight, in contact, and where that changes.
+
+    Programs with play take long to compile.
+    """
     step, ways = sys.modules[Exponential.__module__], []
     smooth = step._advance_smooth
     monkeypatch.setattr(step, "_advance_smooth", lambda *given: ways.append(1) or smooth(*given))
@@ -67,13 +70,13 @@ def noise(N: int, hold: int = 5, seed: int = 0) -> np.ndarray:
 
 
 def rotor(states: np.ndarray, hub: int = 2) -> tuple[np.ndarray, np.ndarray]:
-    """Angle and speed of the rotor against the hub; the last two states of these machines."""
+    """Angle and speed of the rotor relative to the hub, the last two states of these machines."""
     assert states.shape[1] >= hub + 2
     return states[:, -2], states[:, -1]
 
 
 def test_the_rotor_crosses_the_gap_alone():
-    """From the middle of the play under a constant voltage: a t^2 / 2 while nothing is touched."""
+    """From the middle of the play under a constant voltage: a t^2 / 2 until the rotor meets the stop."""
     states = simulate_states(lone(gap=GAP, share=SHARE), np.full(40, 0.5), Ts)
     t, a = Ts * np.arange(40), 0.5 * GAIN / (SHARE * J)
     r, s = rotor(states)
@@ -82,10 +85,10 @@ def test_the_rotor_crosses_the_gap_alone():
     np.testing.assert_allclose(r[flying], a * t[flying] ** 2 / 2, rtol=1e-9, atol=1e-15)
     np.testing.assert_allclose(s[flying], a * t[flying], rtol=1e-9, atol=1e-15)
     np.testing.assert_allclose(states[flying, :2], 0.0, atol=1e-15)
-    # Both together after it, with all the momentum that the motor gave.
+    # Then both move together, with all the momentum that the motor has given.
     assert (r[~flying] == GAP).all() and (s[~flying] == 0).all()
     np.testing.assert_allclose(states[~flying, 1], 0.5 * GAIN * t[~flying] / J, rtol=1e-6)
-    # What hub and rotor do not share in momentum they share in the way of their centre.
+    # Their centre of mass moves as under the torque of the motor alone.
     np.testing.assert_allclose(
         states[~flying, 0] + SHARE * GAP, 0.5 * GAIN * t[~flying] ** 2 / (2 * J), rtol=1e-6
     )
@@ -106,7 +109,7 @@ def test_an_impact_keeps_momentum_and_takes_energy():
     energy = J * ((1 - SHARE) * speed**2 + SHARE * (speed + s) ** 2) / 2
     lost = J * SHARE * (1 - SHARE) * relative**2 / 2
     assert energy[0] - energy[-1] == pytest.approx(lost, rel=1e-9)
-    # The instant of the impact inside its step shows in the way of the hub.
+    # The final angle of the hub depends on the instant of the impact within its step.
     met = 1.5 * GAP / relative
     end = hub * met + (hub + SHARE * relative) * (19 * Ts - met)
     assert states[-1, 0] == pytest.approx(end, abs=1e-12)
@@ -154,7 +157,7 @@ def test_the_rotor_stays_between_its_stops_and_energy_falls():
 
 
 def by_events(u: np.ndarray, hold: int, share: float, inductance: float | None = None) -> np.ndarray:
-    """Hub, deflection and rotor against the hub by scipy, which looks for contact and release."""
+    """Hub, deflection, rotor, their speeds and the current by scipy, with events of contact and release."""
     J_r, J_h, J_a, K = share * 0.0021, (1 - share) * 0.0021, 0.0059, 1.61
 
     def carried(x, v, side):
@@ -260,7 +263,7 @@ def test_slopes_are_those_of_central_differences():
 
 
 def test_a_predictor_knows_nothing_of_the_rotor():
-    """The gain is that of the machine as one, and the rotor moves with the hub that it corrects."""
+    """The gain is that of the machine without play; angle and speed of the rotor in the play get none."""
     known, plain = joint(), paper(hub_damping=0.004, joint_damping=0.003)
     gains = [kalman_gains(m, [{"hub": 1e-4, "joint": 1e-5}], NOISE, Ts)[0] for m in (known, plain)]
     np.testing.assert_allclose(gains[0][:4], gains[1], rtol=1e-9)
@@ -290,7 +293,7 @@ def test_one_gear_is_enough():
 
 
 def test_a_search_meets_play_at_its_size():
-    """Left out of every run while it is off, and scored by runs with gaps in steps of two."""
+    """Play is left out of all runs while it is off, and scored by runs with gaps in factors of two."""
     made = make_record(
         {("backlash", "hub"): {"play": 2 * GAP}}, seed=2100, seconds=3.0, fs=500.0, perturb=0.0
     )

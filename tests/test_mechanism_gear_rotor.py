@@ -1,4 +1,4 @@
-"""What stands on the motor's side of a gear with play: closed forms, scipy, the gear without play."""
+"""Effects on the motor's side of a gear with play: closed forms, scipy, the gear without play."""
 
 import numpy as np
 import pytest
@@ -29,7 +29,7 @@ def noise(N: int, hold: int = 10, seed: int = 2) -> np.ndarray:
 
 @pytest.mark.parametrize("gear", [RIGID, ELASTIC])
 def test_a_rotor_in_flight_is_braked_alone(gear):
-    """It crosses the play under motor and friction, while the hub does not know of either."""
+    """It crosses the play under motor torque and friction, neither of which moves the hub."""
     machine = single_inertia(J, motor=fx.Motor(back_emf=0.0)) + gear + fx.Coulomb("rotor", LEVEL)
     volts = 1.0
     states = simulate_states(machine, np.full(12, volts), Ts)
@@ -38,7 +38,7 @@ def test_a_rotor_in_flight_is_braked_alone(gear):
     assert 3 < flying.sum() < 10
     np.testing.assert_allclose(states[flying, 2], (a * t**2 / 2)[flying], atol=1e-12)
     np.testing.assert_allclose(states[flying, :2], 0.0, atol=1e-15)
-    # Below its level the motor does not even begin to cross, though the hub is free.
+    # With a motor torque below the friction level the rotor rests, although the hub is free.
     held = simulate_states(machine, np.full(50, 0.9 * LEVEL / (EMF / RESISTANCE)), Ts)
     np.testing.assert_allclose(held, 0.0, atol=1e-15)
 
@@ -62,7 +62,7 @@ def test_without_play_it_is_the_hubs():
     np.testing.assert_allclose(simulate(apart, u, Ts), simulate(one, u, Ts), rtol=0, atol=1e-12)
     both = plain() + fx.Backlash("hub", gap=0.0) + fx.Coulomb("hub", 0.01) + fx.Coulomb("rotor", 0.02)
     sum_of_both = simulate(plain() + fx.Coulomb("hub", 0.03), u, Ts)
-    # Two contacts that stop in one step know of each other to first order only.
+    # Two contacts that stop in one step are coupled to first order only.
     np.testing.assert_allclose(simulate(both, u, Ts), sum_of_both, rtol=0, atol=2e-4)
 
 

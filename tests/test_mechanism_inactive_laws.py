@@ -1,4 +1,4 @@
-"""Slopes along laws that are evaluated beside a run, against JAX's derivative of runs with them."""
+"""Sensitivities by laws that are evaluated beside a run, against JAX's derivative of runs with them."""
 
 import dataclasses
 
@@ -23,7 +23,7 @@ from rotflex_jax.mechanism.simulate import PredictorStep, prepared_run, read_out
 from rotflex_jax.runtime.xla import double_precision
 
 Ts, N = 0.004, 150
-# Each program runs once, so time spent on making it fast is lost.
+# Each program runs once, so optimising it takes longer than it saves.
 ROUGH = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
 JOINT = paper(joint_damping=1e-3)
 RUBBING = JOINT + fx.Coulomb("hub", 0.03) + fx.CubicSpring("joint", 4.0)
@@ -46,7 +46,7 @@ CASES = {
 
 @dataclasses.dataclass(frozen=True)
 class Run:
-    """A recording in two windows, and a model as it runs there."""
+    """A recording in two windows, and a model with first states and gain for it."""
 
     joint: Mechanism
     solver: Solver
@@ -71,7 +71,7 @@ class Run:
         return cls(joint, solver, x0, K, u, y, 1.0 * (rng.random(N) < 0.9), np.arange(N) // 90)
 
     def outputs(self, effect: fx.Effect, values: jax.Array) -> jax.Array:
-        """Of the model with the effect put in, by an ordinary scan of all its steps."""
+        """Outputs of the model with the effect added, by an ordinary scan of all steps."""
         whole = self.joint + effect
         structure, first = whole.structure, len(self.joint.values)
         size, own = Layout.of(structure).size, self.x0.shape[1]
@@ -90,12 +90,12 @@ class Run:
 
 @pytest.mark.parametrize("case", CASES)
 def test_slopes_are_those_of_the_model_with_the_effect(case: str) -> None:
-    """At a contact of its own: another one without a level is no part of the model that a refit fits."""
+    """Reference: JAX's derivative of a scan of the model with the effect, and no other inactive contact."""
     joint, solver, effect = CASES[case]
     assert adds_to_step(effect, joint.structure, solver)
     run, values = Run.of(joint, solver), np.array(list(effect.values.values()))
     ways = np.array([[1.0 * (n == a) for n in effect.values] for a in effect.amplitudes])
-    # The sum as well, which two directions make up.
+    # The sum of the directions as well.
     ways = np.array([effect.declared()[n].typical for n in effect.values]) * np.vstack(
         [ways, ways.sum(axis=0)]
     )

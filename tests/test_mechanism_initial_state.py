@@ -1,4 +1,4 @@
-"""The first state comes from the first samples, and nothing else of the outputs reaches a model."""
+"""The first state comes from the first samples, and a free run uses no other measured output."""
 
 import dataclasses
 
@@ -30,7 +30,7 @@ def joint(plant: Plant | dict):
 
 @pytest.fixture(scope="module")
 def truth():
-    """A joint in motion, by the arena's own simulator, and a model with the true numbers."""
+    """A joint in motion, by the arena's own simulator, and a model with the true parameters."""
     r = make_record({("coulomb", "hub"): 1.0}, seed=11, seconds=4.0, fs=200.0, rms=2.0)
     return r, joint(r["truth"]["plant"]) + fx.Coulomb("hub", level=0.03)
 
@@ -53,7 +53,7 @@ def test_recovers_the_true_state_from_noise_free_samples(truth):
     assert np.ptp(true[:, 2]) > 1 and np.ptp(true[:, 3]) > 1  # in motion
     np.testing.assert_allclose(found[:, :2], true[:, :2], atol=2e-5)
     np.testing.assert_allclose(found[:, 2:], true[:, 2:], atol=2e-3)
-    # The fit through the simulator is what does it: the straight line is far off.
+    # The accuracy is due to the fit with the simulator: straight lines are far off.
     rough = rough_states(mechanism.structure, y, r["Ts"])
     assert np.abs(rough - true).max() > 0.3
 
@@ -68,7 +68,7 @@ def test_recovers_its_own_state_exactly(truth):
 
 
 def test_a_stretch_is_read_by_itself(truth):
-    """Whatever the others hold: a servo that has turned a hundred times, or noise."""
+    """The first state of a segment does not depend on other segments, with a large angle or with noise."""
     r, mechanism = truth
     u, y = stretches(r, "y", STARTS, 40)
     gates = np.ones(len(mechanism.effects))
@@ -79,12 +79,12 @@ def test_a_stretch_is_read_by_itself(truth):
     again = initial_states(mechanism, Exponential(), gates, u, other, r["Ts"])
     same = [1, 3, 4]
     np.testing.assert_allclose(again[same], found[same], rtol=0, atol=1e-9)
-    # The angle of a servo has no zero of its own.
+    # A constant in the angle of the hub only adds to that angle.
     np.testing.assert_allclose(again[0] - found[0], [600, 0, 0, 0], atol=1e-5)
 
 
 def test_other_numbers_of_stretches_compile_nothing_and_change_none(truth):
-    """Arrays have place for many; those beyond them are filled up to the next power of two."""
+    """Arrays have a least number of rows; larger ones are filled up to the next power of two."""
     r, mechanism = truth
     gates, starts = np.ones(len(mechanism.effects)), np.linspace(50, 740, 70).astype(int)
     u, y = stretches(r, "y", starts, 40)
@@ -101,7 +101,7 @@ def test_other_numbers_of_stretches_compile_nothing_and_change_none(truth):
 
 
 def test_encoder_noise_is_averaged(truth):
-    """Over many stretches the speeds scatter less than a difference of two samples would."""
+    """Errors of the speeds are smaller than those of a difference of two samples."""
     r, mechanism = truth
     starts = np.arange(50, 750, 20)
     u, y = stretches(r, "y", starts, 40)
@@ -114,7 +114,7 @@ def test_encoder_noise_is_averaged(truth):
 
 
 def test_what_is_not_measured_is_told_by_the_motion(truth):
-    """From the hub angle alone, the deflection too."""
+    """The deflection is estimated from the angle of the hub alone."""
     r, mechanism = truth
     alone = dataclasses.replace(mechanism, outputs={"theta": "hub"})
     u, y = stretches(r, "clean", [200, 500], 60)
@@ -126,19 +126,19 @@ def test_what_is_not_measured_is_told_by_the_motion(truth):
 
 
 class Flexure(fx.Spring):
-    """A spring of a user, with a name of its own."""
+    """A spring that a user has defined, with another name."""
 
     name = "flexure"
 
 
 class Flywheel(fx.Inertia):
-    """An inertia of a user."""
+    """An inertia that a user has defined."""
 
     name = "flywheel"
 
 
 def test_springs_and_inertias_of_a_user_are_what_they_say():
-    """From the angle of the arm alone: a spring at the joint is relaxed, whatever its name is."""
+    """From the angle of the arm alone, the spring at the joint is set relaxed, whatever its name is."""
     plain = dataclasses.replace(paper(), outputs={"arm": "arm"})
     own = plain.without("spring", "joint") + Flexure("joint", 1.2)
     y = 0.3 + np.zeros((1, 20, 1))
@@ -167,7 +167,7 @@ def test_a_measured_speed_is_read_as_a_speed():
     ],
 )
 def test_each_segment_is_read_by_itself(mechanism, channel, state, samples):
-    """Straight lines through five segments: one channel says what a state is at the start of each."""
+    """Straight lines through five segments: the value of one channel is a state at the start of each."""
     rng, t = np.random.default_rng(3), np.arange(samples)[:, None] * 0.01
     start, slope = rng.normal(size=(2, 5, len(mechanism.channels)))
     y = start[:, None] + slope[:, None] * t
@@ -181,7 +181,7 @@ def test_each_segment_is_read_by_itself(mechanism, channel, state, samples):
 
 
 def scrambled(y: np.ndarray, kept: np.ndarray) -> np.ndarray:
-    """Nonsense of the same size wherever a model may not look."""
+    """The outputs, with noise of their own size added at all samples that a model must not use."""
     rng = np.random.default_rng(9)
     out = y + rng.normal(size=y.shape) * y.std(axis=0)
     out[kept] = y[kept]
@@ -200,7 +200,7 @@ def test_simulate_looks_at_the_first_samples_only(truth):
     other = recorded(r, scrambled(r["y"], kept))
     assert other.n_init == record.n_init
     np.testing.assert_array_equal(model.simulate(other), run)
-    # At the last sample it may look at, it does look.
+    # The last of the first samples is used.
     y = r["y"].copy()
     y[record.n_init - 1] += 0.05
     assert np.abs(model.simulate(recorded(r, y)) - run).max() > 1e-3
@@ -239,7 +239,7 @@ def sine_means(sine: float, cosine: float, w: float, t: np.ndarray) -> np.ndarra
     ids=["drift", "disturbance", "delay"],
 )
 def test_the_voltage_of_a_window_is_that_of_the_whole_recording(effect, driven):
-    """The bare joint under a voltage that was changed by hand is what every window has to repeat."""
+    """Each window repeats a run of the bare joint under the voltage that the effect makes, in closed form."""
     u = np.random.default_rng(4).normal(size=600)
     record = Recording(u=u, y=simulate(paper(), driven(u), 0.004), Ts=0.004, accept=("units",))
     run = Model(paper() + effect).simulate_windows(record, 0.4)
@@ -253,7 +253,7 @@ def test_a_short_rest_joins_the_last_window(truth):
 
 
 def test_prediction_uses_the_past_only(truth):
-    """A sample changes predictions after it, never its own or an earlier one."""
+    """A measured sample changes later predictions, but not its own or an earlier one."""
     r, mechanism = truth
     model, noise = Model(mechanism), np.array([5e-4, 5e-4])
     run = model.predict(recorded(r), {"hub": 1e-4}, noise)

@@ -1,4 +1,4 @@
-"""The steady gain against SciPy's Riccati solver, and its process noise against quadrature."""
+"""The steady-state Kalman gain against SciPy's Riccati solver, its process noise against quadrature."""
 
 import dataclasses
 import itertools
@@ -34,7 +34,7 @@ def quadrature(A: np.ndarray, g: np.ndarray, Ts: float) -> np.ndarray:
 
 
 def pushed(joint, port: str) -> np.ndarray:
-    """How a unit torque at a port enters the state."""
+    """Derivative of the state that a unit torque at a port causes."""
     g = np.zeros(len(linearise(joint).A))
     g[2:4] = np.linalg.solve(M, VECTORS[port])
     return g
@@ -52,7 +52,7 @@ def expected(joint, Q: np.ndarray, noise: np.ndarray, Ts: float) -> np.ndarray:
 
 @pytest.mark.parametrize("Ts", [0.002, 0.01])
 @pytest.mark.parametrize("inductance", [None, 0.18e-3])
-def testprocess_covariance_covariance(Ts, inductance):
+def test_process_covariance(Ts, inductance):
     joint = paper(inductance=inductance)
     A = linearise(joint).A
     for port in VECTORS:
@@ -105,7 +105,7 @@ def test_more_disturbance_trusts_the_sensor_more():
 
 SPINNING = (
     dataclasses.replace(single_inertia(0.002, damping=0.001), outputs={"tacho": ("hub", "speed")}),
-    # The angle that both share is the one that nothing shows.
+    # No sensor shows the common angle of hub and arm.
     dataclasses.replace(
         paper(hub_damping=0.004, joint_damping=0.003),
         outputs={"motor": ("hub", "speed"), "tip": ("arm", "speed")},
@@ -115,7 +115,7 @@ SPINNING = (
 
 @pytest.mark.parametrize("machine", SPINNING, ids=["inertia", "joint"])
 def test_an_angle_that_no_sensor_shows_has_the_gain_that_the_filter_tends_to(machine):
-    """Against the covariance filter run step by step: its gain comes to rest, its variance never does."""
+    """Reference: the covariance recursion step by step; its gain converges while a variance grows."""
     Ts, intensity, noise = 0.01, {"hub": 1e-5}, np.full(len(machine.channels), 0.01)
     space, n = linearise(machine), len(machine.coordinates)
     inertia = M if n == 2 else np.array([[0.002]])
@@ -167,7 +167,7 @@ def test_the_filter_reaches_the_variance_that_the_equation_promises():
 
 @pytest.mark.parametrize(("damping", "determined"), [(1e6, True), (1e16, False)])
 def test_a_model_too_fast_for_double_precision_has_no_gain(damping, determined):
-    """Damping over inertia times the period: of 5e6 the exponential keeps nine digits, of 5e16 none."""
+    """For damping / inertia * Ts = 5e6 the matrix exponential has nine correct digits, for 5e16 none."""
     gains = kalman_gains(single_inertia(0.002, damping=damping), [{"hub": 1e-5}], np.array([1e-4]), 0.01)
     assert np.isfinite(gains).all() == determined
     assert np.isnan(gains).any() == (not determined)

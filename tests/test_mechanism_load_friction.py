@@ -1,4 +1,4 @@
-"""Friction that grows with the load of a gear: closed forms, an independent simulation, sticking, C code."""
+"""Friction that grows with the load of a gear: closed forms, scipy, sticking, sensitivities, a fit."""
 
 import jax
 import jax.numpy as jnp
@@ -27,7 +27,7 @@ def steps(N: int = 500, hold: int = 10, size: float = 3.0) -> np.ndarray:
 
 @pytest.mark.parametrize("volts", [0.05, 0.113, 0.116, 0.2, 2.0, -2.0])
 def test_a_motor_alone_loses_its_share(volts):
-    """Nothing but the inertia takes the torque: half of it passes the middle."""
+    """The load is the inertia alone, so half of the torque passes the gear; motion in closed form."""
     u, t = np.full(200, volts), Ts * np.arange(200)
     found = simulate(single_inertia(J) + FRICTION, u, Ts)[:, 0]
     push = (1 - DRIVING / 2) * GAIN * abs(volts) - FC
@@ -40,7 +40,7 @@ def test_a_motor_alone_loses_its_share(volts):
 
 
 def test_a_coasting_motor_is_driven():
-    """Without voltage the back-EMF brakes, and the gear takes its share of that torque on top."""
+    """Without voltage the back-EMF brakes, and gear friction adds its share of that torque."""
     states = simulate_states(single_inertia(J) + FRICTION, np.zeros(100), Ts, np.array([0.0, 5.0]))
     t, rate = Ts * np.arange(100), (1 + DRIVEN / 2) * LOSS / J
     speed = (5.0 + FC / (rate * J)) * np.exp(-rate * t) - FC / (rate * J)
@@ -49,7 +49,7 @@ def test_a_coasting_motor_is_driven():
 
 
 def test_a_load_turns_a_gear_only_where_friction_lets_it():
-    """A bent joint pulls at a hub without voltage: it holds where half of `driven` and the level suffice."""
+    """A deflected joint pulls at a hub without voltage; it rests if `level + driven pull / 2 >= pull`."""
     pull, K = 0.3, 1.61
     start = np.array([0.0, pull / K, 0.0, 0.0])
     for driven, holds in ((1.6, False), (1.7, True)):
@@ -57,7 +57,7 @@ def test_a_load_turns_a_gear_only_where_friction_lets_it():
         machine = paper() + fx.LoadFriction("hub", level=0.05, driving=0.0, driven=driven)
         hub = simulate_states(machine, np.zeros(3), Ts, start)[:, 0]
         assert (np.abs(hub).max() < 1e-15) == holds
-    # From 2 on the arm swings by itself, however far it is bent.
+    # From `driven` = 2 on the hub is held at any deflection, and the arm swings alone.
     machine = paper() + fx.LoadFriction("hub", level=0.01, driving=0.0, driven=2.1)
     states = simulate_states(machine, np.zeros(400), Ts, start)
     assert np.abs(states[:, 0]).max() < 1e-14
@@ -98,7 +98,7 @@ def test_against_scipy_in_a_joint():
 
 
 def servo_by_scipy(goal: np.ndarray, period: float, width: float = 2e-3) -> tuple[np.ndarray, float, float]:
-    """A pendulum on a servo at every sample, the law written out, and how far limit and weight take part."""
+    """Angle of a pendulum on a servo, the law written out; largest duty before the limit; largest weight."""
     kt, R, supply, weight, inertia = 0.35, 3.4, 7.4, 0.49 * 9.80665 * 0.1, 0.49 * 0.1**2 + 0.002
     slope = 400 * 4096 / (2 * np.pi) / (256 * 885)
 
@@ -121,7 +121,7 @@ def servo_by_scipy(goal: np.ndarray, period: float, width: float = 2e-3) -> tupl
 def test_weight_and_the_limit_of_a_servo_are_part_of_the_load():
     period, goal = 0.005, np.repeat([0.4, 2.2, -1.2, 1.0, -2.4, 0.1], 60)
     expected, duty, weight = servo_by_scipy(goal, period)
-    assert duty > 2 and weight > 0.4  # far beyond the limit, and a weight as large as the motor's torque
+    assert duty > 2 and weight > 0.4  # far beyond the limit, and a weight of half the motor's largest torque
     machine = xl330_pendulum() + FRICTION
     for solver, error in ((Exponential(substeps=8), 5e-4), (Exponential(), 4e-3)):
         found = simulate(machine, goal, period, solver=solver)[:, 0]
@@ -131,7 +131,7 @@ def test_weight_and_the_limit_of_a_servo_are_part_of_the_load():
 
 
 def test_the_load_is_that_of_both_sides_at_any_state():
-    """Goal, limit, weight and what a hot motor loses, in the closed form; every part matters."""
+    """Reference: the closed form, with goal, limit, weight and the loss of a hot motor."""
     machine = xl330_pendulum() + fx.Heating("hub") + FRICTION
     heat = machine.effect("heating", "hub")
     gates = np.ones(len(machine.effects))
@@ -148,7 +148,7 @@ def test_the_load_is_that_of_both_sides_at_any_state():
 
 
 def test_the_current_and_the_gear_take_part():
-    """A quick current changes little; teeth apart transmit nothing, so the hub meets the level alone."""
+    """A small inductance changes little; separated teeth transmit nothing, so friction is its level alone."""
     u = steps()
     plain = simulate(paper() + FRICTION, u, Ts)
     np.testing.assert_allclose(simulate(paper(inductance=1e-5) + FRICTION, u, Ts), plain, atol=2e-4)
@@ -191,7 +191,7 @@ def test_a_fit_finds_both_shares():
 
 
 def test_tied_shares_are_one_in_a_fit_and_in_a_file(tmp_path):
-    """A fit moves `driving` alone and `driven` follows; what is simulated is the effect with both alike."""
+    """A fit moves `driving` alone and `driven` follows; runs are those of the effect with equal shares."""
     tied = paper(joint_damping=0.003) + fx.LoadFriction(
         "hub", level=FC, driving=DRIVING, driven=9.0, tied=True
     )
@@ -210,7 +210,7 @@ def test_tied_shares_are_one_in_a_fit_and_in_a_file(tmp_path):
 
 @pytest.mark.parametrize("push", [0.3, 0.375, 0.385, 0.5, 0.62, 0.64, 0.7])
 def test_friction_in_proportion_to_the_motors_torque_holds_a_weight(push):
-    """A motor lifts where `push - level - share push` is more than the weight, and lets it sink below."""
+    """It rises if `push (1 - share) - level > weight`, and sinks if `push (1 + share) + level < weight`."""
     weight, level, share = 0.48, 0.02, 0.2
     lifts, sinks = push * (1 - share) - level > weight, push * (1 + share) + level < weight
     m = single_inertia(J) + fx.Gravity("hub", sine=0.0, cosine=weight)

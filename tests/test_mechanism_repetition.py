@@ -1,4 +1,4 @@
-"""Arithmetic on repeated arrays: the same numbers, each computed once."""
+"""Arithmetic on repeated arrays: the same results, each computed once."""
 
 from typing import Any
 
@@ -13,7 +13,7 @@ D = 5
 
 
 def mixed(repeated: Any, other: jax.Array) -> Any:
-    """What repeated arrays (3, D), (3, 2, D) and (D,) and another one (3, D) meet in a step."""
+    """Operations of a step on repeated arrays (3, D), (3, 2, D) and (D,) and on another array (3, D)."""
     x, A, s = repeated
     rows = jnp.unstack(x)
     y = jnp.stack([rows[1], s * rows[0], jnp.where(rows[2] > 0.2, jnp.sin(rows[2]), s)])

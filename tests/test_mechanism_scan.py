@@ -1,4 +1,4 @@
-"""The derivative rule of the scan, and a linear mechanism in blocks of samples, beside the scan itself."""
+"""The derivative rule of the scan, and a linear mechanism in blocks of samples, against a plain scan."""
 
 import dataclasses
 import functools
@@ -36,7 +36,7 @@ class Pendulum:
 
 
 def plain(step, x0, inputs, constants):
-    """The same states by an ordinary scan, with the derivative that JAX makes of it."""
+    """The same states by an ordinary scan, with JAX's own derivative."""
     return jax.lax.scan(lambda x, w: (step(x, w, constants), x), x0, inputs)[1]
 
 
@@ -132,7 +132,7 @@ def test_many_at_once():
 
 @pytest.mark.parametrize("which", [0, 1], ids=["free run", "predictor"])
 def test_the_step_of_a_joint(which):
-    """The step works on many samples side by side as it works on one: friction, memory, current."""
+    """The step applied to many samples at once equals an ordinary scan: friction, memory, current."""
     with double_precision():
         step, *point = joint(CHUNK_SAMPLES + 90)[which]
         way = tangent(tuple(point), 7)

@@ -1,4 +1,4 @@
-"""Sensitivities carried with the run, and those of inactive effects, beside derivatives of whole runs."""
+"""Sensitivities computed with the run, and inactive ones, against derivatives of whole runs."""
 
 import dataclasses
 import functools
@@ -35,11 +35,11 @@ from rotflex_jax.runtime.xla import double_precision, loops_are_fast
 
 Ts, N = 0.004, 150
 SOLVER = Exponential(passes=2)
-# Each program runs once, so time spent on making it fast is lost.
+# Each program runs once, so optimising it takes longer than it saves.
 ROUGH = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
 
 BASELINES = {
-    # The current and a memory stand in front of and behind the states of what is absent.
+    # Absent effects have states on both sides of the memory, and behind the motor current.
     "memory and current": paper(inductance=0.18e-3, joint_damping=1e-3) + fx.Dahl("arm", 0.004, 0.01),
     "dry friction": paper(joint_damping=1e-3) + fx.Coulomb("hub", 0.03),
 }
@@ -57,10 +57,10 @@ FEW = {
 
 
 def places(case: str) -> list[tuple[type[fx.Effect], str]]:
-    """All that a search tries, as far as the baseline lacks it; a few of them beside dry friction."""
+    """All candidates of a search that the baseline lacks; a few of them for dry friction."""
     has = {(e.name, e.at) for e in BASELINES[case].effects}
     pairs = [(cls, port) for cls, port in search_places(BASELINES[case]) if (cls.name, port) not in has]
-    # A gap of nothing has no slope.
+    # A gear with a gap of zero has no derivative.
     pairs = [pair for pair in pairs if not issubclass(pair[0], fx.Gear)]
     return [pair for pair in pairs if case != "dry friction" or (pair[0].name, pair[1]) in FEW]
 
@@ -89,7 +89,7 @@ class Case:
 
 
 def own_states(mechanism: Mechanism, first: int) -> list[int]:
-    """Places in the state of what belongs to the effects from `first` on, counted as they are declared."""
+    """Indices in the state that belong to the effects from `first` on."""
     kept, at = [], 2 * len(mechanism.coordinates)
     for part in ("linear", "memory"):
         for i, e in enumerate(mechanism.effects):
@@ -104,7 +104,7 @@ def case_of(case: str) -> Case:
     baseline = full = BASELINES[case]
     for cls, port in places(case):
         shape = {n: 0.0 if n in cls.amplitudes else 1.1 * s.typical for n, s in cls.declared().items()}
-        shape |= {"limit": 0.8} if cls is fx.Saturation else {}  # one that is met
+        shape |= {"limit": 0.8} if cls is fx.Saturation else {}  # one that the voltage reaches
         full = full + cls(at=port, **shape)
     first, names = len(baseline.effects), full.parameter_names
     listed, dvalues, dgates = [], [], []
@@ -120,7 +120,7 @@ def case_of(case: str) -> Case:
     size, absent = Layout.of(full.structure).size, own_states(full, first)
     present = [i for i in range(size) if i not in absent]
     rng = np.random.default_rng(0)
-    # What a predictor uses that trusts its sensors, and something for the states that are not there.
+    # Gains of a predictor with large process noise, and random gains for the absent states.
     K = 0.05 * rng.normal(size=(size, 2))
     K[present] = kalman_gains(baseline, [{"hub": 1e-4, "joint": 1e-5}], [5e-4, 5e-4], Ts)[0]
     assert np.abs(K[:4]).max() > 50
@@ -137,7 +137,7 @@ def case_of(case: str) -> Case:
 
 @functools.cache
 def found(case: str) -> np.ndarray:
-    """Slopes along the absent effects from the recursion of the baseline alone."""
+    """Inactive sensitivities from the recursion of the baseline alone."""
     c = case_of(case)
     with double_precision():
         present = jnp.array(c.present)
@@ -166,13 +166,13 @@ def test_slopes_are_those_of_the_whole_run(case):
         expected = np.asarray(jax.jit(jax.vmap(slope), compiler_options=ROUGH)(*ways))
     for name, mine, whole in zip(c.names, found(case), expected, strict=True):
         size = np.abs(whole).max()
-        assert size > 1e-6, name  # a drift grows from zero: 2e-6 V in the time of this run
+        assert size > 1e-6, name  # a drift grows from zero, to 2e-6 V in this run
         np.testing.assert_allclose(mine, whole, rtol=0, atol=1e-9 * size, err_msg=name)
 
 
 @functools.cache
 def with_a_little(h: float) -> np.ndarray:
-    """Outputs of the whole run as it is, then with `h` times each direction."""
+    """Outputs of the whole run, first unchanged, then with `h` times each direction."""
     c = case_of("dry friction")
     with double_precision():
         run = jax.jit(jax.vmap(c.run), compiler_options=ROUGH)
@@ -182,7 +182,7 @@ def with_a_little(h: float) -> np.ndarray:
 
 
 def test_slopes_foretell_what_a_little_of_an_effect_does():
-    """Against the difference of two runs, one with a millionth of the effect's usual size."""
+    """Reference: the difference of two runs, one with a millionth of the effect's usual size."""
     c, y = case_of("dry friction"), with_a_little(1e-6)
     for name, mine, moved in zip(c.names, found("dry friction"), (y[1:] - y[0]) / 1e-6, strict=True):
         if name.startswith(("joint.coulomb", "joint.stribeck")):
@@ -258,7 +258,7 @@ def test_slopes_are_those_that_jax_takes(case: str) -> None:
 
 
 def test_slopes_of_a_large_structure_are_one_function():
-    """Play, two kinds of friction with a state, and cogging, in more directions than it has parameters."""
+    """All operations over samples and 32 directions are small calls of compiled functions."""
     if not loops_are_fast():
         pytest.skip("XLA was started without the option for small loops")
     joint = paper() + fx.Backlash("hub") + fx.Dahl("hub") + fx.LuGre("joint") + fx.Cogging("arm")

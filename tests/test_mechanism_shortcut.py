@@ -1,4 +1,4 @@
-"""Quick ways through a step: the same motion as by the general way, and only one of both is computed."""
+"""Shortcuts through a step give the result of the general computation, and only one of both is computed."""
 
 import jax
 import jax.numpy as jnp
@@ -25,7 +25,7 @@ CASES = {
 
 
 def motion(joint: Mechanism, u: np.ndarray, shortcuts: bool) -> np.ndarray:
-    """States (B, N, n) under several voltages, mapped over."""
+    """States (B, N, n) for several voltages, by `jax.vmap`."""
     structure, solver = joint.structure, Exponential()
     step = FreeStep(structure, solver)
 
@@ -44,7 +44,7 @@ def motion(joint: Mechanism, u: np.ndarray, shortcuts: bool) -> np.ndarray:
 
     with double_precision():
         traced = jax.make_jaxpr(jax.vmap(one))(jnp.asarray(u))
-        assert (" cond[" in str(traced)) == shortcuts  # a choice for each voltage would be a selection
+        assert (" cond[" in str(traced)) == shortcuts  # a branch; a selection would compute both
         return np.asarray(jax.jit(jax.vmap(one))(jnp.asarray(u)))
 
 
@@ -52,7 +52,7 @@ def motion(joint: Mechanism, u: np.ndarray, shortcuts: bool) -> np.ndarray:
 def test_the_motion_is_that_of_the_general_way(case: str) -> None:
     rng = np.random.default_rng(0)
     u = np.array([[0.5], [1.5], [4.0]]) * np.repeat(rng.normal(size=(3, N // 30)), 30, axis=1)
-    u[:, N // 2 : N // 2 + 300] = 0.0  # comes to rest
+    u[:, N // 2 : N // 2 + 300] = 0.0  # the machine comes to rest
     X = motion(CASES[case], u, shortcuts=True)
     expected = motion(CASES[case], u, shortcuts=False)
     scale = np.abs(expected).max(axis=(0, 1))
@@ -61,6 +61,8 @@ def test_the_motion_is_that_of_the_general_way(case: str) -> None:
 
 
 def test_one_that_needs_the_general_way_takes_all_along() -> None:
+    """The general computation is used for a whole batch if one of its members needs it."""
+
     def f(x: jax.Array) -> jax.Array:
         return shortcut(lambda: (x > 0, lambda: x[None]), lambda: 10 * x[None])
 
@@ -71,6 +73,8 @@ def test_one_that_needs_the_general_way_takes_all_along() -> None:
 
 
 def test_derivatives_are_those_of_the_way_taken() -> None:
+    """In forward and in reverse mode; the reference is the closed form."""
+
     def f(x: jax.Array) -> jax.Array:
         return shortcut(lambda: (x > 0, lambda: jnp.sin(x)[None]), lambda: jnp.cos(x)[None])[0]
 

@@ -11,11 +11,11 @@ Y = np.array([[0.0, 10.0], [1.0, 10.0], [3.0, 14.0], [4.0, 14.0]])
 E = np.array([[1.0, 2.0], [-1.0, 2.0], [1.0, 2.0], [-3.0, 2.0]])
 
 BY_HAND = {
-    # mean of e^2 is (1 + 1 + 1 + 9) / 4 = 3 and 4; y is 2 and 12 in the mean
+    # mean of e^2 is (1 + 1 + 1 + 9) / 4 = 3 and 4; the means of y are 2 and 12
     "rmse": [np.sqrt(3), 2.0],
     "nrmse": [np.sqrt(12 / 10), 1.0],
     "fit_percent": [100 * (1 - np.sqrt(12 / 10)), 0.0],
-    # e is -0.5 in the mean: its variance 3 - 0.25; a constant error has none
+    # the mean of e is -0.5 and its variance 3 - 0.25; a constant error has variance 0
     "vaf": [100 * (1 - 2.75 / 2.5), 100.0],
     "mae": [1.5, 2.0],
     "max_error": [3.0, 2.0],
@@ -56,13 +56,13 @@ def test_recording_brings_its_channels_and_its_initial_samples(name: str) -> Non
 
 
 def test_errors_in_windows_by_hand() -> None:
-    """Windows of 20 samples, of which 8 are seen; a rest of 16 joins the last, and a rest of 17 does not."""
+    """Windows of 20 samples, 8 of them not scored; a rest of 16 joins the last window, one of 17 does not."""
     starts = {56: [0, 20], 57: [0, 20, 40]}
     rng, recordings, runs = np.random.default_rng(0), [], []
     for N, begin in starts.items():
         r = Recording(u=rng.normal(size=N), y=0.1 * rng.normal(size=(N, 2)), Ts=0.1, n_init=8, accept="short")
         assert metrics.window_starts(r, 2.0)[0].tolist() == begin
-        e = np.full((N, 2), np.nan)  # what a model has seen counts in no way
+        e = np.full((N, 2), np.nan)  # stays in the samples that are not scored
         for k, (i, j) in enumerate(zip(begin, [*begin[1:], N], strict=True)):
             e[i + 8 : j] = [k + 1.0, -0.5]
         np.testing.assert_array_equal(metrics.counted(r, 2.0), np.isfinite(e[:, 0]))

@@ -22,7 +22,7 @@ NOISE = 5e-4
 
 
 def simulated(model, N: int = 3000, Ts: float = 0.004, seed: int = 0) -> rf.Recording:
-    """A recording that a model made, with white noise of the sensors."""
+    """Simulation of a model with white sensor noise, as a recording."""
     rng = np.random.default_rng(seed)
     u = rf.data.excitation.multisine(N, Ts, rms=1.5)
     blank = rf.Recording(u=u, y=rng.standard_normal((N, 2)), Ts=Ts)
@@ -50,12 +50,12 @@ def test_autocorrelation_is_that_of_its_definition() -> None:
 
 @pytest.mark.parametrize("coloured", [False, True])
 def test_bands_hold_what_they_promise(coloured: bool) -> None:
-    # Over many realisations, 1 % of the lags lie outside of the bands where the hypothesis holds.
+    # If the hypothesis of a test holds, 1 % of the lags lie outside its band, over many realisations.
     rng = np.random.default_rng(0)
     outside_white, outside_input = [], []
     for _ in range(200):
         e, u = rng.standard_normal(2000), rng.standard_normal(2000)
-        if coloured:  # a band for white signals would be left by half of the lags
+        if coloured:  # half of the lags lie outside a band for white signals
             e, u = (signal.lfilter([1.0], [1.0, -0.9], x) for x in (e, u))
         tests = residual_tests(e[:, None], u, 0.01, ["theta"])
         outside_white.append(tests.outside_white[:, 1:].mean())
@@ -91,7 +91,7 @@ def test_frequency_response_is_that_of_a_known_filter() -> None:
     y = signal.lfilter(b, a, u)
     found = frequency_response(u, np.column_stack([y, -2 * y]), 0.01)
     f, h = found.frequency, signal.freqz(b, a, worN=found.frequency, fs=100.0)[1]
-    low = f < 10.0  # Hz, the pass band: what is filtered out is known less well
+    low = f < 10.0  # Hz, the pass band: above it the response is estimated less accurately
     assert np.max(np.abs(found.response[0, low] - h[low])) < 0.1
     assert np.all(found.coherence[:, low] > 0.97)
     assert np.allclose(found.response[1], -2 * found.response[0])
@@ -102,7 +102,7 @@ def test_coherence_falls_with_what_does_not_follow_the_input() -> None:
     rng = np.random.default_rng(2)
     u, other = rng.standard_normal((2, 40_000))
     found = frequency_response(u, (u + other)[:, None], 0.01)
-    assert np.mean(found.coherence) == pytest.approx(0.5, abs=0.1)  # half of the power is the input's
+    assert np.mean(found.coherence) == pytest.approx(0.5, abs=0.1)  # half of the power comes from the input
 
 
 def test_a_fit_draws_itself_against_a_recording(recording) -> None:
@@ -121,7 +121,7 @@ def test_a_fit_draws_itself_against_a_recording(recording) -> None:
         "error [deg]",
     ]
     assert figure.axes[-1].get_xlabel() == "time [s]"
-    # The error that is drawn is measured less simulated.
+    # The errors of the first model, which is the true one, are sensor noise.
     drawn = figure.axes[1].lines[0].get_ydata()
     assert np.max(np.abs(drawn)) < np.rad2deg(6 * NOISE)
 
@@ -135,6 +135,8 @@ def test_a_fit_has_the_same_plot(recording) -> None:
 
 
 def test_a_run_that_diverges_is_named_and_hides_nothing(recording) -> None:
+    """The legend names it, and the axes keep the range of the measured outputs."""
+
     class Runaway:
         channels = ("theta", "alpha")
 
@@ -187,7 +189,7 @@ def test_the_report_shows_the_tests_that_were_computed_before(monkeypatch) -> No
     assert clear.sum() > 10
     difference = np.abs(tests.simulated["baseline"].magnitude_db - tests.measured.magnitude_db)[1]
     assert np.quantile(difference[clear], 0.9) < 0.2
-    # Writing the page simulates nothing.
+    # Writing the page must not simulate.
     monkeypatch.setattr(Model, "_run", lambda *given: pytest.fail("the page simulates"))
     monkeypatch.setattr(Model, "predict", lambda *given: pytest.fail("the page predicts"))
     explanation = Explanation(tests=tests)

@@ -1,4 +1,4 @@
-"""A model of frozen weights: what it simulates, which recordings it refuses."""
+"""A series with fixed weights: its simulations, its kernels, and the inputs that it refuses."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Names that come from files: no code in an export, no command for a terminal, no formula in a table."""
+"""Names from files become no code in an export, no command for a terminal and no formula in a table."""
 
 import csv
 import io
@@ -47,7 +47,7 @@ def machine(port: str, unit: str = "V") -> Model:
 
 
 def without_comments(code: str) -> str:
-    """As a compiler reads it: lines joined at a backslash first, then comments out."""
+    """Code after the first steps of a C compiler: lines are joined at a backslash, then comments removed."""
     return re.sub(r"/\*.*?\*/", "", code.replace("\\\n", ""), flags=re.DOTALL)
 
 
@@ -66,7 +66,7 @@ def test_no_name_becomes_a_command_of_latex(name: str) -> None:
     made = latex(machine(name))
     for command in ("input", "write"):
         assert not re.search(rf"(?<!textbackslash\{{\}}){command}\\?[{{1]", re.sub("(?m)^%.*$", "", made))
-    # All brackets that are not letters of a name are in pairs, and no line of a name begins a new one.
+    # Braces that are not part of a name are balanced, and a line break in a name begins no new line.
     bare = re.sub(r"\\[{}]", "", re.sub("(?m)^%.*$", "", made))
     assert bare.count("{") == bare.count("}")
     assert len(made.splitlines()) == len(latex(machine("arm")).splitlines())
@@ -116,7 +116,7 @@ def test_no_cell_of_a_summary_is_a_formula(tmp_path: Path) -> None:
     found = dict(zip(head, cells, strict=True))
     assert found["name"] == "'=1+1" and found["source"] == '\'=cmd|"/c calc"!A1'
     assert found["effects"] == "'@evil@hub" and found["reason"] == r"'+more\x1b[2J"
-    assert found["'-theta_before"] == "-1.0"  # a number is no formula
+    assert found["'-theta_before"] == "-1.0"  # a number is not a formula
     assert spreadsheet_cell("run") == "run"
 
 

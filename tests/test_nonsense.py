@@ -1,4 +1,4 @@
-"""Values that make no sense, function by function: each is refused with one sentence before any work."""
+"""Invalid arguments of public functions: each is refused with one sentence before any computation."""
 
 import inspect
 import math
@@ -40,7 +40,7 @@ AT_REST = rf.Recording(
 
 
 def refused(call: Callable[[], object], phrase: str) -> None:
-    """One readable sentence that says it, without Python inside."""
+    """The call raises `InputError` with one sentence that matches the phrase and contains no Python."""
     with pytest.raises(InputError) as caught:
         call()
     sentence = str(caught.value)
@@ -49,7 +49,7 @@ def refused(call: Callable[[], object], phrase: str) -> None:
     assert not re.search("[.!] [A-Z]|np[.]|dtype|array\\(|object at 0x", sentence), sentence
 
 
-# Each function with good arguments, and the arguments that are replaced by what makes no sense.
+# Each function with valid arguments; a test replaces one of them by an invalid value of `BAD`.
 FUNCTIONS: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     "fit": (rf.fit, {"mechanism": JOINT, "recordings": RUN}),
     "many_starts": (rf.many_starts, {"mechanism": JOINT, "recordings": RUN}),

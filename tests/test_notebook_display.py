@@ -1,4 +1,4 @@
-"""What a notebook shows: everything that matters is there, safe against what users call things, and light."""
+"""Displays in a notebook are complete, escape the names that users chose, and load no plotting library."""
 
 import dataclasses
 import io
@@ -23,7 +23,7 @@ from rotflex_jax.text.svg import Panel, bars, signals, staircase
 
 
 def read(html: str) -> str:
-    """The text of a card, as a person reads it; and it must be well-formed."""
+    """The visible text of a card, which must be well-formed."""
     return unescape(" ".join(ElementTree.fromstring(html.replace("\xa0", " ")).itertext()))
 
 
@@ -50,7 +50,7 @@ def fitted() -> Fit:
 def test_a_recording_says_what_was_measured() -> None:
     text = read(moved(source="<script>alert(1)</script>")._repr_html_())
     assert "2000 samples, 10 s at 200 Hz" in text and "<script>alert(1)" in text
-    # 0.5 rad at most, read in degrees; the voltage keeps its unit.
+    # Angles in radians are shown in degrees; the voltage keeps its unit.
     low, high = re.search(r"theta deg (\S+) … (\S+)", text).groups()
     assert float(high) == pytest.approx(np.rad2deg(moved().channel("theta").max()), rel=0.01)
     assert float(low.replace("−", "-")) < 0 and "voltage V" in text
@@ -117,7 +117,7 @@ def test_a_staircase_falls_where_the_error_falls() -> None:
     ]
     axis, noise, first, last = levels
     assert first < last < noise < axis  # downwards on the screen
-    # A decade is a decade: the scale is logarithmic.
+    # The scale is logarithmic.
     assert (noise - last) / (last - first) == pytest.approx(np.log10(0.1 / 0.03), rel=0.01)
 
 
@@ -127,7 +127,7 @@ def test_drawings_bear_what_data_hold() -> None:
     gap = np.array([0.0, np.nan, 1.0])
     ElementTree.fromstring(signals(np.arange(3.0), [Panel("flat", [(np.ones(3), "red", "")])], "t"))
     ElementTree.fromstring(signals(np.arange(3.0), [Panel("gap", [(gap, "red", "2 2")])], "t"))
-    # A long signal is thinned, and its extremes survive.
+    # A long signal is thinned, and its extremes are kept.
     spike = np.zeros(100_000)
     spike[54_321] = 1.0
     points = numbers(signals(np.arange(1e5), [Panel("s", [(spike, "red", "")])], "t"), "polyline", "points")[

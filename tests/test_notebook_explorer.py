@@ -1,4 +1,4 @@
-"""A model under sliders, tried without a browser: values of widgets are set, and what they show is read."""
+"""The explorer without a browser: values of its widgets are set, and what the widgets show is checked."""
 
 import io
 import sys
@@ -39,7 +39,7 @@ def test_it_begins_with_the_model_as_given(explorer: Explorer) -> None:
     assert explorer.switches[FRICTION].value and not explorer.switches[SPRING].value
     assert "joint spring" not in " ".join(explorer.switches) and "viscous damping at hub" in explorer.switches
     assert explorer.errors == explorer.given
-    # The truth is as good as the sensor, whose noise is 5e-4 rad: a candidate that is off changes nothing.
+    # Errors of the true model are near the sensor noise of 5e-4 rad: a candidate that is off has no effect.
     assert max(explorer.errors.values()) < 1.5e-3
 
 
@@ -64,7 +64,7 @@ def test_a_moved_number_is_that_of_the_model(explorer: Explorer, recording: rf.R
     np.testing.assert_allclose(
         explorer.model.simulate_windows(recording), by_hand.simulate_windows(recording), atol=1e-12
     )
-    # Another number is moved besides; the slider remembers where each stands.
+    # A second parameter is changed; the slider keeps the factor of each parameter.
     explorer.parameter.value = "hub.coulomb.level"
     assert explorer.factor.value == 1.0
     explorer.factor.value = 0.5
@@ -89,14 +89,14 @@ def test_any_effect_of_the_catalogue_is_added_and_taken_back(explorer: Explorer)
     assert ("coulomb", "hub") not in offered.values() and ("coulomb", "joint") in offered.values()
     explorer.add("coulomb", "joint")
     assert [*labels, "Coulomb friction at joint"] == list(explorer.switches)
-    assert explorer.errors["alpha"] > 2 * before["alpha"]  # the truth has none there
+    assert explorer.errors["alpha"] > 2 * before["alpha"]  # the true model has no friction there
     assert ("coulomb", "joint") not in dict(explorer.addable.options).values()
-    explorer.add("gravity", "hub")  # by default of no size: then at a typical one
+    explorer.add("gravity", "hub")  # its default amplitudes are zero, so it gets a typical value
     assert explorer.model.mechanism.effect("gravity", "hub").sine == 0.02
     explorer.undo()
     explorer.undo()
     assert list(explorer.switches) == labels and explorer.errors == pytest.approx(before)
-    explorer.undo()  # nothing is left to take back
+    explorer.undo()  # nothing is left to undo
     assert explorer.errors == pytest.approx(before)
     with pytest.raises(InputError, match="in the model already"):
         explorer.add("coulomb", "hub")
@@ -112,7 +112,7 @@ def test_several_sliders_a_refit_and_undo(explorer: Explorer) -> None:
     assert (values[level], values[stiffness]) == pytest.approx((0.4 * 0.05, 1.2 * 1.61))
     assert f"{level} = 0.02 N m" in explorer._text.value and explorer.errors["theta"] > 3 * best["theta"]
     worse = dict(explorer.errors)
-    explorer.refit()  # from there back to the truth
+    explorer.refit()  # from these values back to the true ones
     assert explorer.errors["theta"] < 1.2 * best["theta"] and explorer.sliders[level].value == 1.0
     assert "refitted: converged" in explorer._text.value
     explorer.undo()

@@ -1,4 +1,4 @@
-"""Rules that every notebook keeps: a question as title, claims that it checks, no algorithm of its own."""
+"""Rules for every notebook: a question as title, claims that it checks, no algorithm of its own."""
 
 import re
 import sys
@@ -29,7 +29,7 @@ def test_a_notebook_asks_a_question_and_checks_its_answer(script: Path) -> None:
     assert title.endswith("?")
     last = text.rpartition("\n# %%\n")[2]
     assert last.count("assert ") >= 3 and last.rstrip().endswith('print("All claims hold.")')
-    # What computes belongs into the package, where it is tested.
+    # Algorithms belong into the package, where they are tested.
     assert not re.search(r"lax\.|jax\.jit|jax\.grad|optimize\.", text)
 
 

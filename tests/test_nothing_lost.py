@@ -1,4 +1,4 @@
-"""What was found is not lost: a full disk, a report that fails, Ctrl-C at any moment."""
+"""Results are not lost by a full disk, a report that fails, or Ctrl-C at any moment."""
 
 import errno
 import json
@@ -35,7 +35,7 @@ RUN = rf.Recording(u=np.sin(K), y=np.cos(K / 3), Ts=0.1)
 ROW = RecordingRow("run", "run.csv", reason="none")
 INPUT: Any = SimpleNamespace(t=K, u=K, Ts=0.1, separates=("a", "b"))
 
-# What is written, and the name of the file in the folder.
+# Functions that write a file into a folder, and the name of the file.
 WRITERS: dict[str, tuple[Callable[[Path], object], str]] = {
     "recording": (lambda folder: save_csv(RUN, folder / "run.csv"), "run.csv"),
     "model": (lambda folder: Model(rf.joints.paper()).save(folder / "model.json"), "model.json"),
@@ -52,7 +52,7 @@ WRITERS: dict[str, tuple[Callable[[Path], object], str]] = {
 
 
 class FullDisk:
-    """A file that takes nothing."""
+    """A file on a full disk."""
 
     def __enter__(self) -> "FullDisk":
         return self
@@ -91,7 +91,7 @@ def test_full_disk_leaves_the_old_file_and_names_the_new_one(
 def test_every_file_is_written_by_one_function() -> None:
     direct = r"\.write_text\(|\.write_bytes\(|\bopen\([^)]*[\"'][wax]"
     direct += r"|savefig\((?!picture|buffer|file)|json\.dump\(|np\.save\w*\((?!text)|\.to_csv\([^)]"
-    # A program that is kept for the next process is renamed into its place there.
+    # The second file writes compiled programs, by a temporary file that is renamed.
     allowed = {PACKAGE / "text" / "files.py", PACKAGE / "runtime" / "persistent_jit.py"}
     found = {
         f"{path.relative_to(PACKAGE)}: {line.strip()}"
@@ -120,7 +120,7 @@ def test_what_cannot_be_written_costs_nothing_else(
     places = {"json": tmp_path / "r.json", "model": tmp_path / "m.json", "report": tmp_path / "page"}
     places["report"].mkdir()
     written = {**places, "report": places["report"] / "index.html"}
-    # A link into a folder that is gone: the name is free, and nothing can be written there.
+    # A link into a missing folder: the file does not exist yet and cannot be written.
     written[fails].symlink_to(tmp_path / "gone" / "file")
     monkeypatch.setattr(rf, "discover", lambda *_, **__: searched())
     monkeypatch.setattr(terminal, "print_discovery", lambda _: print("The rounds explain the record."))
@@ -154,7 +154,7 @@ def test_rounds_are_kept_until_the_search_has_ended(tmp_path: Path) -> None:
 
 
 def test_rounds_of_an_earlier_start_are_not_overwritten_by_fewer(tmp_path: Path) -> None:
-    """A search that goes on reports its rounds again; killed after one of them, it keeps the others."""
+    """A continued search reports its rounds again; if it is killed after one of them, none is lost."""
     file = tmp_path / "found.stopped.json"
 
     def reached(*labels: str, digest: str = "a") -> list[str]:
@@ -169,7 +169,7 @@ def test_rounds_of_an_earlier_start_are_not_overwritten_by_fewer(tmp_path: Path)
     assert len(three) == 3
     assert reached("as it is") == reached("as it is", "+ coulomb at hub") == three
     assert len(reached("as it is", "+ coulomb at hub", "+ lag at input", "+ delay at input")) == 4
-    # Another search, or the same one on another way, counts by itself.
+    # A search with other rounds or another digest replaces the file.
     assert len(reached("as it is", "+ lag at input")) == 2
     assert reached("as it is", digest="b") == ["as it is"]
     file.write_text("{")
@@ -178,7 +178,7 @@ def test_rounds_of_an_earlier_start_are_not_overwritten_by_fewer(tmp_path: Path)
 
 @pytest.mark.slow
 def test_killed_at_random_moments_nothing_is_lost(tmp_path: Path) -> None:
-    """A slice of `benchmarks/kills.py`, with the programs of other tests."""
+    """A short run of `benchmarks/kills.py`, with the compiled programs of other tests."""
     programs = Path(__file__).resolve().parents[1] / ".pytest_cache" / "compiled" / "programs"
     assert len(list(kills(2, 1, tmp_path, programs, kinds=("search",)))) == 2
 
@@ -204,8 +204,8 @@ rf.discover = search
 sys.argv = ["rotflex", "demo", "--report", "page", "--json", "found.json"]
 main()
 """
-# Where the signal finds the main thread: in a loop of Python; in compiled code that runs for minutes; where
-# an exception cannot be caught.
+# What the main thread does when the signal arrives: a loop of Python, compiled code that runs for minutes, or
+# a loop that catches and ignores every exception.
 WAITS = {
     "python": "while True: pass",
     "compiled code": 'hashlib.pbkdf2_hmac("sha256", b"", b"", 10**9)',
@@ -219,7 +219,7 @@ WAITS = {
 
 
 def in_a_process(script: str, folder: Path) -> "subprocess.CompletedProcess[str]":
-    """The script run to its end by a process of its own, in a folder."""
+    """Run a script to its end in a new process, in a folder."""
     environment = os.environ | {"PYTHONPATH": str(PACKAGE.parent), "XDG_CACHE_HOME": str(folder / "cache")}
     return subprocess.run(
         [sys.executable, "-c", script],
@@ -267,7 +267,8 @@ STOP.listen = listen
 sys.argv = ["rotflex", "effects"]
 main()
 """
-# What the main thread holds while the other one ends the process.
+# What the main thread holds while the other thread ends the process: the lock of an import, or an output
+# whose flush never returns.
 HELD = {
     "a module that is imported": """
     import multiprocessing
@@ -303,7 +304,7 @@ def test_the_signal_is_heard_before_anything_large_is_loaded(tmp_path: Path) -> 
 
 
 def test_stopped_while_it_is_loaded(tmp_path: Path) -> None:
-    """The signal arrives while compiled modules are imported, where an exception becomes another one."""
+    """The signal arrives during the import of compiled modules, which may replace an exception by another."""
     script = (
         "import os, signal, sys, threading\nfrom rotflex_jax.cli import main\n"
         "from rotflex_jax.cli.stopping import STOP\nheard = STOP.listen\n"

@@ -1,4 +1,4 @@
-"""Every number that README and paper claim of the benchmarks is traced to a generated result."""
+"""Every number that documents quote from the benchmarks is traced to a generated result."""
 
 import json
 import math
@@ -52,7 +52,7 @@ def numbers(text: str) -> list[str]:
 
 
 def about_results(name: str) -> str:
-    """The part of a document that speaks of results."""
+    """The part of a document that reports results."""
     text = (ROOT / name).read_text(encoding="utf-8")
     if name != "README.md":
         return text
@@ -84,7 +84,7 @@ def test_a_section_says_where_its_results_are_of_an_earlier_version(monkeypatch)
     marked = quoted.renewed(text)
     assert marked == text.replace("```\n\n# Two", "```\n\n<!--= versions -->B3.json<!--=-->\n\n# Two")
     assert quoted.renewed(marked) == marked
-    # Where a mark stands already it is kept there, and it may name results that stand in a table.
+    # An existing mark keeps its place, and it may name results that are shown in a table.
     placed = f"# One <!--= versions B4.json --><!--=-->\n\n{first}\n"
     assert quoted.renewed(placed) == placed.replace("--><!--=", "-->B3.json<!--=", 1)
     earlier[:] = ["B4.json"]
@@ -93,7 +93,7 @@ def test_a_section_says_where_its_results_are_of_an_earlier_version(monkeypatch)
 
 
 def test_the_model_to_use_is_compared_with_the_best_method_that_worked():
-    """It is the fit to all where that was taken; errors of a method that failed do not count."""
+    """The model to use is the fit to all if there is one; errors of a method that failed are left out."""
     others = [
         {"status": "ok", "held_out_rmse": {"theta": 3.0, "alpha": 0.5}},
         {"status": "ok", "held_out_rmse": {"theta": 4.0, "alpha": None}},
@@ -131,8 +131,8 @@ def test_a_mark_that_leads_nowhere_says_so(source: str) -> None:
         quoted.quoted(source)
 
 
-# Pages whose tables stand in the text as a benchmark printed them, and the files that hold their numbers. The
-# decimal numbers between the tables must be there too, or be known settings and readings.
+# Pages with tables that a benchmark printed, and the files with the numbers of these tables. Other decimal
+# numbers of a page must be in these files too, or be listed in `KNOWN`.
 TABLES = {
     "compare.md": sorted(f"B5/{file.name}" for file in (claims.RESULTS / "B5").glob("*.json")),
     "measured_joint.md": ["B1.json"],
@@ -247,7 +247,7 @@ KNOWN = {
 
 
 def leaves(found: Any) -> Iterator[float]:
-    """Every number of a result; of the next experiment also what its table divides."""
+    """Every number of a result; for the next experiment also the ratios of its table."""
     if isinstance(found, dict):
         if "original" in found and "inputs" in found:
             worth = [i["margin"] for i in (found["original"], *found["inputs"])]
@@ -261,7 +261,7 @@ def leaves(found: Any) -> Iterator[float]:
 
 
 def untraced(text: str, values: list[float]) -> list[str]:
-    """Decimal numbers that no value gives in its own unit, degrees, thousandths or %."""
+    """Decimal numbers that equal no value in its own unit, degrees, thousandths or %, nor 1.96 times one."""
     loose = []
     for number in re.findall(r"(?<![\w.])[-−+]?\d+\.\d+(?![\w.])", text):
         digits, value = len(number.partition(".")[2]), float(number.replace("−", "-"))
@@ -286,7 +286,7 @@ def test_every_number_in_the_text_of_a_notebook_is_in_its_code_or_in_what_it_sho
             parts = {"text": output.get("text", ""), **output.get("data", {})}
             shown += "".join("".join(part) for kind, part in parts.items() if kind.startswith("text"))
     values = {float(n) for n in re.findall(r"\d+(?:\.\d+)?", shown)}
-    # A share may be told in %, a time in ms.
+    # The text may give a share in % and a time in ms.
     values |= {round(scale * v, 9) for v in values for scale in (100, 1e3)}
     assert [n for n in numbers(text) if float(n) not in values] == []
 
@@ -296,10 +296,10 @@ def test_pages_of_results_hold_what_the_results_hold(page: str) -> None:
     values = [v for file in TABLES[page] for v in leaves(claims.results(file))]
     text = prose((ROOT / "docs" / page).read_text(encoding="utf-8"))
     assert [n for n in untraced(text, values) if n not in KNOWN.get(page, ())] == []
-    # Which code the tables are of is said, by a mark that names them or one beside a quotation of them.
+    # The version of the code is given for every table: the page quotes its file, or a mark names it.
     told = quoted.told_of((ROOT / "docs" / page).read_text(encoding="utf-8"))
     assert [f for f in TABLES[page] if not {f, f.partition("/")[0]} & told] == []
-    # A number that is nowhere is noticed.
+    # A number that is in no result is reported.
     assert untraced("| error | 0.123456 |", values) == ["0.123456"]
 
 

@@ -1,4 +1,4 @@
-"""The damped least-squares step beside scipy, a closed form, and points where the residuals have no value."""
+"""Damped least squares against scipy and closed forms, and where residuals are not finite."""
 
 from collections.abc import Callable
 
@@ -28,7 +28,7 @@ def rosenbrock(x):
 
 
 def decay(x):
-    """Two exponentials sampled at twenty instants, less data that no parameters meet exactly."""
+    """A sum of two exponentials at 20 times, less data that no parameters reproduce exactly."""
     t = jnp.linspace(0.0, 3.0, 20)
     data = 2.0 * jnp.exp(-0.7 * t) + 0.5 * jnp.exp(-3.0 * t) + 0.05 * jnp.cos(9.0 * t)
     return x[0] * jnp.exp(-jnp.exp(x[1]) * t) + x[2] * jnp.exp(-jnp.exp(x[3]) * t) - data
@@ -39,7 +39,7 @@ def equations(residuals: Callable) -> Callable:
 
 
 def plain(residuals: Callable) -> Callable:
-    """The same for a caller in numpy."""
+    """The compiled normal equations as numpy arrays."""
     made = jax.jit(equations(residuals))
     return lambda x: jax.device_get(made(jnp.asarray(x)))
 
@@ -64,7 +64,7 @@ def test_the_minimum_is_that_of_scipy(case: str) -> None:
     assert found.status == Status.CONVERGED
     assert found.cost == pytest.approx(reference.cost, rel=1e-8, abs=1e-12)
     np.testing.assert_allclose(found.x, reference.x, rtol=1e-5, atol=1e-5)
-    # The loop in compiled code counts the run at the start too, and takes the same way.
+    # The compiled loop counts the evaluation at the start too, and takes the same steps.
     assert int(progress.evaluations) == found.evaluations + 1
     assert int(progress.status) == Status.CONVERGED
     np.testing.assert_allclose(x, found.x, rtol=1e-6, atol=1e-6)
@@ -89,7 +89,7 @@ def test_limits_shorten_steps_and_leave_the_minimum() -> None:
     np.testing.assert_allclose(x, [1.0, 1.0], atol=1e-6)
     first = np.array([p[0] for p in points])
     assert np.abs(first[1] - first[0]) == pytest.approx(0.1)
-    assert len(points) > 20  # 2.2 in steps of 0.1 at most
+    assert len(points) > 20  # a distance of 2.2 in steps of at most 0.1
 
 
 def test_a_bounded_step_is_that_of_scipy_within_a_box() -> None:
@@ -130,7 +130,7 @@ def test_several_dampings_of_one_matrix_at_once() -> None:
 
 
 def test_a_direction_that_the_residuals_do_not_determine_stays() -> None:
-    """Only the sum of the first two counts, and the third not at all: the sum is right, the rest stays."""
+    """The residuals depend only on the sum of the first two parameters: this is fitted, the rest stays."""
     A = np.array([[1.0, 1.0, 0.0], [2.0, 2.0, 0.0], [0.5, 0.5, 0.0]])
     b = A @ [1.0, 2.0, 0.0] + [0.1, 0.0, -0.1]
     found = minimise(lambda x: NormalEquations.of(A, A @ x - b), np.array([0.5, 0.0, 7.0]), RULES)
@@ -142,7 +142,7 @@ def test_a_direction_that_the_residuals_do_not_determine_stays() -> None:
 
 
 def test_points_without_a_value_shorten_the_step() -> None:
-    """`log x - 1` has no value below zero, where the first full step leads."""
+    """`log x - 1` has no value below zero, where the first full step ends."""
 
     def made(x: np.ndarray) -> NormalEquations:
         with np.errstate(invalid="ignore"):
@@ -170,7 +170,7 @@ def test_points_without_a_value_shorten_the_step() -> None:
 
 
 def test_slopes_without_a_value_end_it() -> None:
-    """The square root has a value at zero, but no slope."""
+    """The square root has a value at zero, but no finite derivative."""
 
     def made(x: np.ndarray) -> NormalEquations:
         return NormalEquations(np.array([np.sqrt(x[0])]), np.array([np.inf]), np.array([[np.inf]]))
@@ -186,7 +186,7 @@ def test_where_the_evaluations_are_used_up_it_still_runs() -> None:
 
 
 def test_no_progress_over_a_window_ends_it() -> None:
-    """Along the bend of the valley steps gain little; a window asks for more."""
+    """In the curved valley steps gain little, so the gain over a window falls below the least progress."""
     with double_precision():
         slow = minimise(plain(rosenbrock), np.array([-1.2, 1.0]), Rules(window=4, least_progress=1.0))
     assert slow.status == Status.CONVERGED
@@ -221,7 +221,7 @@ def test_several_problems_end_as_each_alone_and_share_their_runs() -> None:
 
 
 def test_steps_may_act_on_anything() -> None:
-    """On the logarithm of a positive number, with the point kept as the number itself."""
+    """The step changes the logarithm of a positive number, and the point is the number itself."""
     found = minimise(
         lambda p: NormalEquations.of(np.array([[p * p]]), np.array([p**2 / 2 - 8.0])),
         100.0,

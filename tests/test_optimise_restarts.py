@@ -1,4 +1,4 @@
-"""Where restarts of a fit begin, and when there are enough."""
+"""Restarts of a fit: when they are needed, where they begin, and when there are enough."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from scipy.stats import norm
 
 from rotflex_jax.optimise.restarts import FAR, MISSING, NEAR, enough, misses_something, moved_by_chance
 
-# Standard deviation of a standard normal number that is cut at 2.
+# Standard deviation of a standard normal number that is limited to -2 to 2.
 CUT = np.sqrt(quad(lambda n: min(abs(n), 2.0) ** 2 * norm.pdf(n), -9, 9)[0])
 
 
@@ -16,7 +16,7 @@ def test_parameters_move_by_a_share_of_themselves(distance):
     z, bounded = np.array([-3.0, 5.0, 0.0]), np.array([True, False, False])
     random = np.random.default_rng(1)
     moved = np.array([moved_by_chance(z, bounded, distance, random) for _ in range(4000)]) - z
-    # One with a bound is exp(z); one at zero moves as if its size were 0.3.
+    # The coordinate of a bounded parameter has size one; a coordinate at zero is given the size 0.3.
     expected = distance * CUT * np.array([1.0, 5.0, 0.3])
     np.testing.assert_allclose(moved.std(axis=0), expected, rtol=0.05)
     assert np.all(np.abs(moved.mean(axis=0)) < 0.1 * expected)

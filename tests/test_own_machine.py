@@ -1,7 +1,7 @@
-"""Somebody's own machine, described by its parts, and somebody's own effect.
+"""A user's own machine, described by its parts, and a user's own effect.
 
-The machine: three ports, one sensor of a speed that is rectified. Its recordings come from a simulator of
-its own (`turntable.py`).
+The machine has three ports, an encoder and a speed sensor whose output is rectified. Its recordings come from
+an independent simulator (`turntable.py`).
 """
 
 import dataclasses
@@ -37,7 +37,7 @@ from rotflex_jax.text.numbers import as_read
 
 MOTOR = ("torque_constant", "back_emf", "resistance", "gear_ratio", "efficiency")
 
-# The numbers are what a data sheet says: up to a quarter off.
+# Parameters as in a data sheet, which differ from the true ones by up to a quarter.
 turntable = rf.Mechanism(
     coordinates=["phi", "psi"],
     ports={"motor": (1, 0), "belt": (-1, 1), "platter": (0, 1)},
@@ -63,7 +63,7 @@ def recording(truth: Truth, seed: int = 1) -> rf.Recording:
 
 @pytest.fixture
 def magnetic_brake():
-    """An effect of a user's own, known to the search for the length of a test."""
+    """A user's own effect, in the catalogue for the duration of a test."""
 
     @register
     @dataclasses.dataclass(frozen=True)
@@ -112,7 +112,7 @@ def test_the_joint_is_searched_as_it_says_itself():
 
 
 def test_a_lone_tacho_has_no_bias_of_its_own():
-    """It could not be told from an offset of the voltage."""
+    """Without another sensor the bias could not be distinguished from an offset of the voltage."""
     alone = dataclasses.replace(
         turntable,
         outputs={"tacho": ("platter", "speed")},
@@ -136,7 +136,7 @@ def test_an_effect_that_was_not_registered_is_named():
 
 
 def test_first_guess_of_the_state_uses_springs_where_sensors_are_silent():
-    """The platter's angle is not measured, and its speed only without a sign: the belt tells both."""
+    """The platter's angle and the sign of its speed are not measured: both follow from a relaxed belt."""
     t = np.arange(25) * 0.004
     for way in (1.0, -1.0):
         y = np.column_stack([12.0 + 3.0 * way * t, np.full(25, 3.0)])
@@ -145,7 +145,7 @@ def test_first_guess_of_the_state_uses_springs_where_sensors_are_silent():
 
 
 def test_a_rectified_sensor_corrects_the_state_the_right_way_round():
-    """A gain for straight sensors would push a platter that turns backwards ever faster."""
+    """With the gain of a sensor that is not rectified, corrections get the wrong sign in reverse motion."""
     run = recording(Truth())
     true = Model(
         turntable.with_values(
@@ -181,9 +181,9 @@ def test_fit_of_ones_own_machine_recovers_its_numbers():
 
 @pytest.mark.slow
 def test_discovery_finds_what_is_hidden_in_ones_own_machine(magnetic_brake):
-    """Called as for any joint: a user's own effect is found at the right port, before the friction beside it.
+    """The first round finds a user's own effect at the right port, before the friction at the same port.
 
-    One round, among the laws of the speed at motor and platter; notebook 02 finds both, with their numbers.
+    Candidates are laws of the speed at motor and platter. Notebook 02 finds both effects, with parameters.
     """
     train, test = recording(FOR_THE_NOTEBOOK).split(0.7)
     follow = Live("search")
@@ -191,12 +191,12 @@ def test_discovery_finds_what_is_hidden_in_ones_own_machine(magnetic_brake):
     pairs = [(cls, at) for cls, at in search_places(turntable) if cls.name in laws and at != "belt"]
     assert len(pairs) == 2 * len(laws)
     result = rf.discover(turntable, train, test, candidates=pairs, rounds=1, progress=follow)
-    # The tacho does not show the way, so a fit may end in another optimum: kinds and ports are certain,
-    # and that they help, but not every number.
+    # The tacho does not measure the direction, so a fit may end in another local minimum: effect, port and
+    # smaller errors are certain, but not every parameter.
     assert (result.rounds[0].effect, result.rounds[0].port) == ("magnetic_brake", "platter")
     before, after = result.baseline.held_out_rmse_windows, result.final.held_out_rmse_windows
     assert all(after[c] < before[c] / 3 for c in before)
-    # What was shown while it ran, in units that people read.
+    # What was shown while the search ran, in the units of displays.
     assert follow.labels[:2] == ["as it is", "+ magnetic brake at platter"]
     units = [as_read(1.0, unit)[1] for unit in test.units]
     shown = [follow.errors[f"{channel} [{unit}]"] for channel, unit in zip(before, units, strict=True)]
@@ -205,7 +205,7 @@ def test_discovery_finds_what_is_hidden_in_ones_own_machine(magnetic_brake):
 
 @pytest.mark.slow
 def test_a_machine_of_which_only_speeds_are_measured(tmp_path):
-    """No sensor tells where it stands, and so no recording has anything to say about that."""
+    """No sensor measures a position; the search finds the hidden friction, its level and the inertia."""
     pairs = [(CATALOG[name], "shaft") for name in ("coulomb", "quadratic_drag", "cogging")]
     result = rf.discover(SPINDLE, *spun(inner=20).split(0.7), candidates=pairs)
     assert result.verdict == "found"

@@ -1,4 +1,4 @@
-"""What people get: wheel, source distribution, recipe, container, citation, manual page, completion."""
+"""What is distributed: wheel, source distribution, recipe, container, citation, manual page, completion."""
 
 import os
 import re
@@ -72,7 +72,7 @@ def test_source_distribution_holds_tests_documents_and_licence(built: Path) -> N
 
 
 def test_unpacked_wheel_runs_outside_of_the_tree(built: Path, tmp_path: Path) -> None:
-    """The dependencies are those of this environment; `.ci/package` tries it in an empty one."""
+    """The dependencies are those of this environment; `.ci/package` tests the wheel in an empty one."""
     zipfile.ZipFile(next(built.glob("*.whl"))).extractall(tmp_path / "site")
     program = (
         "import pathlib, sys, rotflex_jax, rotflex_jax.cli as cli;"
@@ -92,7 +92,7 @@ def test_completion_is_installed_and_completes(tmp_path: Path) -> None:
         "COMP_CWORD": "1",
     }
     command = f'"{sys.executable}" -m rotflex_jax'
-    # The shell that asks is the one that it is written for.
+    # Completion is installed for the shell that runs the command.
     install = ["bash", "-c", f"{command} --install-completion; exit $?"]
     run = subprocess.run(install, env=around, capture_output=True, text=True, check=False)
     assert run.returncode == 0, run.stderr
@@ -108,7 +108,7 @@ def test_completion_is_installed_and_completes(tmp_path: Path) -> None:
 def test_manual_page_is_that_of_the_program() -> None:
     page = (ROOT / "docs/rotflex.1").read_text()
     assert page == manual.page(), "write it again: python docs/generate/manual.py"
-    # Nothing reaches the formatter as a command but those of man(7).
+    # The page contains no commands for the formatter other than those of man(7).
     commands = {line.split()[0] for line in page.splitlines() if line.startswith((".", "'"))}
     assert commands == {'.\\"', ".TH", ".SH", ".SS", ".P", ".TP"}
     for option in ("--held-out", "--continue", "--counts", "--install-completion"):
@@ -125,7 +125,7 @@ def test_conda_recipe_says_what_the_project_says() -> None:
     assert recipe["package"]["name"] == PROJECT["name"]
     assert recipe["context"]["version"] == PROJECT["version"]
     wanted = requirements(PROJECT["dependencies"]) | {"python": PROJECT["requires-python"]}
-    wanted["matplotlib-base"] = wanted.pop("matplotlib")  # there without a window toolkit
+    wanted["matplotlib-base"] = wanted.pop("matplotlib")  # the package of conda without a window toolkit
     needs = recipe["requirements"]
     assert requirements(needs["run"]) == wanted
     assert len(needs["run"]) == len(PROJECT["dependencies"]) + 1
@@ -153,7 +153,7 @@ PUBLISHED_SCHEMAS = {
 
 
 def schema_errors(file: Path, schema: str) -> str:
-    """What a published schema finds wrong; the schemas are those in the package."""
+    """Errors of a file by a published schema, of which `check_jsonschema` contains a copy; empty if none."""
     pytest.importorskip("check_jsonschema")
     command = [sys.executable, "-m", "check_jsonschema", "--builtin-schema", f"vendor.{schema}", str(file)]
     done = subprocess.run(command, capture_output=True, text=True)

@@ -1,4 +1,4 @@
-"""The manuscript has the form that the Journal of Open Source Software asks for, and can be set."""
+"""The manuscript has the form that the Journal of Open Source Software requires, and can be typeset."""
 
 import re
 import sys

@@ -1,4 +1,4 @@
-"""Unconstrained coordinates and physical values: one to one, and no bound is ever left."""
+"""The transform between unconstrained coordinates and physical values: one to one, and within all bounds."""
 
 import math
 
@@ -26,7 +26,7 @@ def constrain(specs, z):
 
 
 def inside(spec: Specification) -> st.SearchStrategy[float]:
-    """Values away from the bounds, where the way back is exact."""
+    """Values away from the bounds, where the inverse is exact."""
     if math.isfinite(spec.lower) and math.isfinite(spec.upper):
         span = spec.upper - spec.lower
         return st.floats(spec.lower + 0.01 * span, spec.upper - 0.01 * span)
@@ -66,10 +66,10 @@ def test_physical_is_constrain_with_its_derivative(z):
 
 
 def test_closed_forms():
-    """ln 2 above the bound doubles the way to it; a third of a box is at the logit of a third."""
+    """p is typical z, lower + exp(z), upper - exp(z) or, with both bounds, a logistic curve."""
     z = np.array([1.5, np.log(2.0), np.log(2.0), np.log(0.5), np.log(2.0)])
     np.testing.assert_allclose(constrain(ALL, z), [0.03, 2.0, 2.5, -0.5 + 3.5 / 3, 3.0], rtol=1e-12)
-    # Far from the bound of 0.5 as well as near it.
+    # The inverse, near the bound of 0.5.
     near = Transform.of([RAISED]).unconstrain(np.array([0.6]))
     np.testing.assert_allclose(near, np.log(0.1), rtol=1e-12)
 

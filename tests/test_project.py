@@ -1,4 +1,4 @@
-"""The project as a whole: its documents, its layers, what importing it does."""
+"""The project as a whole: its documents, its layers, and the effects of importing it."""
 
 import ast
 import json
@@ -41,7 +41,7 @@ def imports_of(file: Path) -> set[str]:
 
 
 def project_files() -> list[Path]:
-    """The texts of the project: no caches, no environments, nothing that was generated."""
+    """Text files of the project, without caches, environments and generated files."""
     found = []
     for folder, folders, names in os.walk(ROOT):
         keep = lambda name: (  # noqa: E731 - used once, on the next line
@@ -69,7 +69,7 @@ def test_readme_promises_one_line_that_ci_runs(name: str, end: str) -> None:
     assert command.endswith(end)
     ci = (ROOT / ".ci" / "run").read_text()
     assert f"readme_command {name})" in ci
-    # Nothing but the README's own commands installs the package there.
+    # Only the commands of the README install the package there.
     assert "pip install" not in ci
 
 
@@ -107,7 +107,7 @@ def test_contributing_example_is_a_working_effect() -> None:
 
 
 def test_no_file_names_a_place_on_some_machine() -> None:
-    # The brackets keep this file from naming them itself.
+    # Because of the brackets the pattern does not match itself.
     pattern = re.compile(r"(?<![\w.])/(?:[r]oot|[h]ome|[U]sers|[o]pt|[w]ork)/\w")
     found = project_files()
     assert ROOT / "README.md" in found
@@ -130,7 +130,7 @@ def test_imports_point_down() -> None:
     for file in MODULES:
         own = name_of(file).partition(".")[0]
         if own == "__init__":
-            continue  # the package's front door names everything
+            continue  # the `__init__` of the package imports from all layers
         assert own in height, f"{own} has no layer in pyproject.toml"
         for target in imports_of(file):
             part = target.partition(".")[0]

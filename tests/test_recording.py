@@ -1,4 +1,4 @@
-"""A recording: its defaults, its parts, and what it says about the quality of its data."""
+"""A recording: its defaults, its parts, its signals, and the findings on the quality of its data."""
 
 import dataclasses
 import pickle
@@ -22,7 +22,7 @@ COUNT = 2 * np.pi / 4096
 
 
 def swinging(N: int = 4000, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """A voltage and two smooth angles that follow it: a filtered integral, and its change."""
+    """A voltage and two smooth angles: the integral of a filtered voltage, and a decaying oscillation."""
     u = noise(N, Ts, seed=seed)
     speed = np.zeros(N)
     for k in range(N - 1):
@@ -33,7 +33,7 @@ def swinging(N: int = 4000, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
 
 
 def stop_and_go(rests: int = 8) -> tuple[np.ndarray, np.ndarray]:
-    """A hub that dry friction brings to rest, time and again at the very ends of its motion."""
+    """A hub that dry friction brings to rest, again and again exactly at the ends of its motion."""
     s = np.linspace(0, 1, 101)
     rise = np.where(s < 0.5, 2 * s**2, 1 - 2 * (1 - s) ** 2)
     away, push = np.append(rise, np.ones(650)), np.append(2 * np.sign(0.5 - s), np.full(650, 0.1))
@@ -148,7 +148,7 @@ BASE, MOTOR = "acceleration of the base [m/s^2]", "second motor [A]"
 
 
 def moving(N: int = 4000) -> Recording:
-    """A joint on a base that moves, beside a second motor."""
+    """A recording with two signals: the acceleration of the base, and the current of a second motor."""
     u, y = swinging(N)
     return Recording(u=u, y=y, Ts=Ts, signals={BASE: np.arange(N), MOTOR: -np.arange(N)})
 
@@ -162,7 +162,7 @@ def test_signals_are_cut_and_joined_with_the_recording() -> None:
     (again,) = joined(whole.split(0.7)[::-1])
     for name in whole.signals:
         np.testing.assert_array_equal(again.signals[name], whole.signals[name])
-    # Means as of the input: of 0, 1, 2 and so on.
+    # Signals are averaged like the input: the first mean is that of 0, 1 and 2.
     np.testing.assert_array_equal(whole.decimate(3).signals[MOTOR], -np.arange(1.0, 3999.0, 3.0))
     np.testing.assert_array_equal(pickle.loads(pickle.dumps(whole)).signals[BASE], whole.signals[BASE])
 
@@ -232,7 +232,8 @@ def test_digests_have_signals_where_there_are_any() -> None:
         start=1.5,
         accept="saturated",
     )
-    # As the version computed it that knew no signals (commit 963d166): results are stored with digests.
+    # Results are stored with digests, so the digest without signals must stay that of commit 963d166, which
+    # had no signals.
     known = "78585956cc1d98473654666fc8d5e3fc6e0977b490719f7b049a6eb20187d96c"
     assert digest_of_recordings([recording, *recording.split(0.5)]) == known
     cases = [{}, {"p": k}, {"q": k}, {"p": -k}, {"p": k, "q": -k}, {"p": -k, "q": k}]
@@ -266,10 +267,10 @@ def test_step_is_found_whatever_its_unit_offset_and_rounding(scale: float) -> No
     assert quantisation_step(levels * step + 0.3 * step) == pytest.approx(step)
     assert quantisation_step((levels * step).astype(np.float32)) == pytest.approx(step, rel=1e-5)
     assert quantisation_step(2 * levels * step) == pytest.approx(2 * step)
-    # The same level twice, a rounding error apart, is no level of its own.
+    # Values that differ only by a rounding error are one level.
     far_off = 1000 * step * (np.arange(4000) % 2)
     assert quantisation_step(levels * step + far_off - far_off / 3 * 3) == pytest.approx(step)
-    # No two neighbouring levels: the smallest gap is two steps.
+    # If no two neighbouring levels occur, the smallest gap is two steps.
     sparse = np.cumsum(np.tile([2, 3], 20))[np.arange(4000) % 40]
     assert quantisation_step(sparse * step) == pytest.approx(step)
     in_degrees = np.rad2deg(levels * COUNT)
@@ -282,7 +283,7 @@ def test_noise_free_numbers_have_no_step(seed: int) -> None:
     assert quantisation_step(y[:, 0]) is None
     assert quantisation_step(np.repeat(y[:, 1], 3)) is None
     assert quantisation_step(steps(4000, Ts, seed=seed)) is None
-    held = np.maximum.accumulate(y[:, 0])  # exactly still for long stretches
+    held = np.maximum.accumulate(y[:, 0])  # exactly constant over long stretches
     assert quantisation_step(held) is None
 
 
@@ -316,7 +317,7 @@ def test_sensor_that_cuts_off_is_refused_unless_accepted(seed: int, step: float)
 
 def test_sensor_that_stays_at_its_limit_while_it_is_driven_is_saturated() -> None:
     u, y = swinging(seed=1)
-    theta = y[:, 0] + np.linspace(0, 60, len(u))  # drifts into the limit and never comes back
+    theta = y[:, 0] + np.linspace(0, 60, len(u))  # drifts into the limit and stays there
     Recording(u=u, y=theta, Ts=Ts)
     with pytest.raises(InputError, match="saturated"):
         Recording(u=u, y=np.minimum(theta, theta[1500]), Ts=Ts)

@@ -1,4 +1,4 @@
-"""Wrapped angles, outliers, sensors that stand still and sampling periods that no joint has."""
+"""Wrapped angles, outliers, frozen sensors, and implausible sampling periods."""
 
 import numpy as np
 import pandas as pd
@@ -46,7 +46,7 @@ def kinds(frame: pd.DataFrame) -> list[str]:
 
 
 FAST = 4.0 * THETA + np.pi - 4.0 * THETA[MOVING]
-"""The hub of a machine that goes past half a turn in fast motion."""
+"""Angle of a hub that passes half a turn in fast motion."""
 
 
 def test_a_wrapped_angle_is_named_with_its_first_jump_and_no_unit() -> None:
@@ -59,7 +59,7 @@ def test_a_wrapped_angle_is_named_with_its_first_jump_and_no_unit() -> None:
         assert f"after {first * TS:g} s" in said and "numpy.unwrap" in said
         assert "looks like" not in said and "degrees=True" not in said
     assert len(T) == rf.load(table(theta=np.unwrap(theta))).N
-    # Arrays are refused too: no model has such an angle.
+    # Arrays are refused too: no model has a wrapped angle as its output.
     with pytest.raises(InputError, match="it is wrapped"):
         rf.Recording(u=U, y=np.column_stack([theta, ALPHA]), Ts=TS)
     accepted = rf.Recording(u=U, y=np.column_stack([theta, ALPHA]), Ts=TS, accept="wrapped", start=3.0)
@@ -94,8 +94,8 @@ def test_outliers_are_named_with_time_and_value_and_no_unit(channel, where, valu
     assert f"'{channel}' is {value:.4g} rad" in said and "at 0.75 s (sample 300)" in said
     assert f"{np.sum(bad[channel] != clean)} of {len(T)} samples" in said
     assert "remove or interpolate" in said and "looks like" not in said
-    assert kinds(bad) == ["outliers"]  # nor is it taken for another fault
-    # Arrays come from a program that knows what they are.
+    assert kinds(bad) == ["outliers"]  # and no other fault is reported
+    # Arrays are not refused: the program that made them is responsible for their values.
     r = rf.Recording(u=U, y=bad[["theta", "alpha"]].to_numpy(), Ts=TS)
     assert [f.kind for f in r.findings if f.severity == "warning"] == ["outliers"]
 
@@ -115,14 +115,14 @@ def test_limits_of_an_outlier() -> None:
     for places, found in ((10, True), (11, False)):
         assert outliers(changed(x, list(range(20, 20 + 30 * places, 30)), -9.0)).any() == found
     step = x + 5.0 * (np.arange(400) > 200)
-    assert not outliers(step).any()  # what does not come back is no outlier
+    assert not outliers(step).any()  # a jump without a return is not an outlier
     decay = np.concatenate([np.zeros(50), 0.5 ** np.arange(50.0)])
     assert not outliers(decay).any()
     pulse = 0.01 * np.sin(np.arange(600) / 300) * (np.arange(600) > 5)
     pulse[300:308] += 0.3 * np.sin(np.pi * np.arange(8) / 7)
-    assert outliers(pulse, 0.05).any() and not outliers(pulse, 0.2).any()  # moves fast, but as a machine may
+    assert outliers(pulse, 0.05).any() and not outliers(pulse, 0.2).any()  # fast, but possible for a machine
     assert not outliers(np.random.default_rng(2).normal(size=4000)).any()
-    assert not outliers(changed(np.zeros(400), [200], 1.0)).any()  # nothing to compare with
+    assert not outliers(changed(np.zeros(400), [200], 1.0)).any()  # there is no motion to compare with
 
 
 def test_a_conversion_that_was_made_is_not_advised_again() -> None:
@@ -151,7 +151,7 @@ def test_a_long_sampling_period_is_refused_as_an_option_as_in_a_column() -> None
     assert rf.load(table(t=1000 * T), time_unit="s").Ts == 2.5
     assert rf.load(table(t=1000 * T), accept="units").Ts == 2.5
     assert rf.Recording(u=U, y=y, Ts=0.2).decimate(5).Ts == 1.0
-    # What is no angle of a joint may be slow: the level of a tank.
+    # A quantity other than an angle may be sampled slowly, such as the level of a tank.
     assert rf.load(frame, Ts=4.0, outputs={"level": "theta"}, units={"level": "V"}).Ts == 4.0
 
 
@@ -165,7 +165,7 @@ def test_an_impossible_speed_at_an_impossible_rate_names_the_unit_of_the_time() 
     assert "the unit of the time looks wrong" in said and "degrees=True" not in said
 
 
-# Sensors that stand still
+# Frozen sensors
 
 
 def test_a_frozen_stretch_is_named_from_when_to_when() -> None:
@@ -198,14 +198,14 @@ def test_a_machine_at_rest_and_one_that_sticks_and_slips_are_not_reported(place,
         made = make_record([place], kind=kind, seed=2, seconds=10.0, fs=fs)
         for step in (STEP, 8 * STEP):
             y = np.round(made["y"] / step) * step
-            # The input comes to nothing for a part of the time.
+            # With the second input, the first 101 samples of the voltage are zero.
             for u in (made["u"], made["u"] * (np.arange(len(y)) > 100)):
                 r = rf.Recording(u=u, y=y, Ts=made["Ts"], accept=quality.ACCEPTABLE)
                 assert not {f.kind for f in r.findings} & set(NEW)
 
 
 def test_a_joint_that_friction_holds_through_a_weak_input_is_at_rest() -> None:
-    """Stick and slip, step by step: the hub follows a strong input, and is exactly still else."""
+    """Simulated stick-slip: the hub follows a strong input and is exactly at rest under a weak one."""
     k = np.arange(4000)
     u = np.where(k % 1000 < 500, 0.4, 3.0) * np.sin(k / 30)
     theta, speed = np.zeros(4000), 0.0
@@ -218,7 +218,7 @@ def test_a_joint_that_friction_holds_through_a_weak_input_is_at_rest() -> None:
         theta[j] = theta[j - 1] + TS * speed
     theta = np.round(theta / STEP) * STEP
     rests = np.flatnonzero(np.diff(theta) == 0)
-    assert len(rests) > 800  # long stretches at rest under an input that moves
+    assert len(rests) > 800  # long stretches at rest while the input varies
     assert frozen(u, theta[:, None], TS) is None
 
 
@@ -228,6 +228,6 @@ def test_measured_joints_have_none_of_these_faults(measured) -> None:
 
 
 def test_digests_do_not_know_the_new_faults() -> None:
-    """Results are stored with digests of parts, which accept everything."""
+    """Results are stored with digests of parts, which contain the accepted faults, so these are fixed."""
     assert quality.ACCEPTABLE[: len(quality.IN_DIGESTS)] == quality.IN_DIGESTS
     assert not set(NEW) & set(quality.IN_DIGESTS)

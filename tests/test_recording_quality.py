@@ -1,4 +1,4 @@
-"""Limits of the checks of a recording from both sides; an absolute arm angle is told from a deflection."""
+"""Checks of a recording on both sides of their limits; distinction of an absolute angle from a deflection."""
 
 from collections.abc import Callable
 
@@ -19,7 +19,7 @@ from rotflex_jax.recording.quality import (
 )
 from rotflex_jax.recording.samples import even_spacing
 
-# Effects that could look like it: they hold the arm, pull it, bend an angle, or act while nothing moves.
+# Effects that might make the distinction wrong: friction, gravity, play, the gain of a sensor, a second mode.
 HIDDEN = [
     (("coulomb", "arm"), "steps"),
     (("gravity", "arm"), "sweep"),
@@ -41,12 +41,12 @@ def test_the_angle_in_the_room_is_told_from_a_deflection(place, kind) -> None:
     for arm, absolute in ((alpha, False), (-alpha, False), (room, True), (room - 0.7, True)):
         r = rf.Recording(u=made["u"], y=np.column_stack([theta, arm]), Ts=made["Ts"])
         assert warned(r) == absolute
-        # Parts of the recording are no reason to doubt a deflection either.
+        # Parts of a recording with a deflection give no warning either.
         assert not any(warned(r.slice(k, k + 250)) for k in range(0, 1750, 250)) or absolute
 
 
 def deflection(theta: np.ndarray, t: np.ndarray, hertz: float, damping: float) -> np.ndarray:
-    """The deflection of an arm on a spring whose hub is moved as given: a'' + 2 d w a' + w^2 a = -theta''."""
+    """Deflection of an arm on a spring for a given motion of the hub: a'' + 2 d w a' + w^2 a = -theta''."""
     w = 2 * np.pi * hertz
     system = StateSpace([[0, 1], [-(w**2), -2 * damping * w]], [[0], [1]], [[1, 0]], [[0]])
     return lsim(system, -np.gradient(np.gradient(theta, t), t), t)[1]
@@ -54,7 +54,7 @@ def deflection(theta: np.ndarray, t: np.ndarray, hertz: float, damping: float) -
 
 @pytest.mark.parametrize("hertz", [0.3, 1.0, 3.0, 10.0])
 def test_no_motion_of_the_hub_makes_a_deflection_look_so(hertz: float) -> None:
-    """Sines where the deflection is as large as theta, drifts, steps, noise: on soft and on stiff springs."""
+    """Motions are sines at which the deflection is as large as theta, drifts, steps and noise."""
     t = np.arange(0, 10, 0.004)
     rng = np.random.default_rng(7)
     equal = np.sin(2 * np.pi * hertz / np.sqrt(2) * t)
@@ -160,7 +160,7 @@ def test_a_step_needs_a_level_that_comes_back(repeated: int, step: float | None)
 @pytest.mark.parametrize(("off", "found"), [(0.0498, True), (0.0502, False)])
 def test_levels_lie_on_a_lattice_to_a_twentieth_of_its_step(off: float, found: bool) -> None:
     levels = np.arange(4001.0)
-    levels[2000] += off  # in the middle, where it moves the lattice by a 4001st of that
+    levels[2000] += off  # in the middle, where it moves the fitted lattice by only a 4001st of that
     step = quantisation_step(np.append(levels, levels))
     assert (step is not None) == found
     assert step is None or step == pytest.approx(1.0, rel=1e-5)
@@ -176,7 +176,7 @@ def test_the_smallest_gap_may_be_up_to_five_steps(smallest: int) -> None:
 
 @pytest.mark.parametrize(("apart", "found"), [(16, True), (18, False)])
 def test_values_that_differ_by_16_units_of_rounding_are_one_level(apart: int, found: bool) -> None:
-    levels = np.arange(32, 65) / 64  # at most one
+    levels = np.arange(32, 65) / 64  # at most one, so that the unit of rounding is EPS
     assert (quantisation_step(np.append(levels, levels - apart * EPS)) is not None) == found
 
 
@@ -190,9 +190,10 @@ def test_a_step_is_a_hundred_times_what_makes_values_equal(share: float, found: 
 
 
 def visits(near: int, far: int, at_end: int, number: int = 2, leaving: int | None = None) -> np.ndarray:
-    """A signal of range one that comes to its upper end so often, from a tenth away in `far` samples.
+    """A signal of range one that goes `number` times to its upper end and stays there for `at_end` samples.
 
-    The last fortieth takes `near` of them. It leaves in the same way, or its last tenth takes `leaving`.
+    The last tenth of the range takes `far` samples on the way there, and the last fortieth `near` of these.
+    On the way back this tenth takes `leaving` samples, by default `far`.
     """
     away = leaving or far
 
@@ -211,12 +212,12 @@ def is_cut(x: np.ndarray, u: np.ndarray | None = None, Ts: float = 0.01, step: f
 
 @pytest.mark.parametrize(("ratio", "found"), [(2.47, False), (2.53, True), (5.95, True), (6.05, False)])
 def test_an_end_is_reached_straight_where_four_times_as_far_takes_longer(ratio: float, found: bool) -> None:
-    """Above 2.5 times as long; above six times it has paused, which says nothing."""
+    """From 2.5 to six times as long: above six times the signal has paused, which is no evidence."""
     far = round(400 * ratio)
     assert is_cut(visits(400, far, 20)) == found
-    # Arriving and leaving must both be straight; a parabola takes twice as long.
+    # Arriving and leaving must both be straight; a parabola takes twice as long for four times as far.
     assert is_cut(visits(400, far, 20, leaving=800)) is False
-    # The lower end is looked at as the upper.
+    # The lower end is checked like the upper one.
     assert is_cut(-visits(400, far, 20)) == found
 
 
@@ -240,6 +241,7 @@ def test_a_signal_that_is_cut_at_zero_is_rectified() -> None:
     [((5, 4), False), ((5, 5), True), ((10,), False), ((2,) * 5, True)],
 )
 def test_ten_samples_at_an_end_in_two_visits(at_end: tuple[int, ...], found: bool) -> None:
+    """A signal is cut off from ten samples at an end on, in at least two visits."""
     x = np.concatenate([visits(100, 400, n, number=1) for n in at_end])
     assert is_cut(x) == found
     assert not found or cut_off(x, None, x, 0.01) == (1.0, 10)
@@ -247,7 +249,10 @@ def test_ten_samples_at_an_end_in_two_visits(at_end: tuple[int, ...], found: boo
 
 @pytest.mark.parametrize(("more", "found"), [(0, False), (1, True)])
 def test_twelve_samples_on_the_way_are_enough(more: int, found: bool) -> None:
-    """From a tenth away and back, at 11 or 12 a visit: a straight way. From a fifth away it is none."""
+    """Within a tenth of the end, arriving and leaving, there are 11 or 12 samples per visit.
+
+    With 12 the motion over this tenth is tested, which is straight; with 11 that over a fifth, which is not.
+    """
     far = np.linspace(1.0, 0.25, 200)
     close = [0.15, 0.15, 0.15, 0.09, *[0.045] * 3]
     arrives = np.concatenate([far, close, [0.04] * more, [0.01]])
@@ -257,7 +262,10 @@ def test_twelve_samples_on_the_way_are_enough(more: int, found: bool) -> None:
 
 @pytest.mark.parametrize(("samples", "found"), [(19, False), (20, True)])
 def test_a_push_both_ways_takes_twenty_samples(samples: int, found: bool) -> None:
-    """A single stay at the end, in which the input, sampled slowly, is strongest both ways."""
+    """A single stay at the end, during which the input is strongest in both directions.
+
+    At a sampling period of 0.1 s the mean over a tenth of a second is a single sample.
+    """
     x = visits(400, 800, samples, number=1)
     u = 0.1 * np.sin(np.arange(len(x)))
     first = np.flatnonzero(x == 1.0)[0]
@@ -279,7 +287,7 @@ def test_a_push_is_four_fifths_of_the_strongest(up: float, down: float, found: b
 
 @pytest.mark.parametrize(("lasts", "found"), [(7, False), (9, True)])
 def test_a_push_is_the_mean_over_a_tenth_of_a_second(lasts: int, found: bool) -> None:
-    """Ten samples: of seven 70 % are left, of nine 90 %, beside pushes that last."""
+    """Over ten samples, a push of seven has a mean of 70 % of a long push, and one of nine 90 %."""
     x = visits(400, 800, 100, number=1)
     u = np.zeros(len(x))
     u[50:90], u[100:140] = 1.0, -1.0
@@ -301,14 +309,14 @@ def is_clipped(u: np.ndarray) -> bool:
 )
 @pytest.mark.parametrize("end", [1, -1])
 def test_a_limit_is_stood_at_unusually_often(samples: int, held: int, often: int, end: int) -> None:
-    """A two-hundredth of the samples, five, or five times as often as at a usual level."""
+    """At least a two-hundredth of all samples, at least five, and five times as many as at a usual level."""
     free = np.repeat(np.random.default_rng(0).uniform(-1, 1, samples // held), held)
     for count, found in ((often - 1, False), (often, True)):
         u = free.copy()
         u[:count] = 2.0 * end
         assert is_clipped(u) == found
     u = np.abs(free) + 0.5 if end > 0 else -np.abs(free) - 0.5
-    u[:often] = 0.0  # standing still is no limit
+    u[:often] = 0.0  # a voltage of zero is not a limit
     assert not is_clipped(u)
 
 
@@ -324,7 +332,7 @@ def test_whole_numbers_over_twenty_are_counts() -> None:
     assert not whole_numbers(np.append(k, 0.5))
 
 
-# -- the angle in the room, and swapped columns -----------------------------------------------------
+# -- the absolute angle of the arm, and swapped columns ---------------------------------------------
 
 TURN = 2 * np.pi * np.arange(4096) / 4096
 
@@ -346,7 +354,7 @@ def test_the_angle_in_the_room_follows_to_a_twentieth_and_then_to_three(
 
 @pytest.mark.parametrize(("apart", "found"), [(0.1, True), (0.3, False)])
 def test_it_follows_with_a_coherence_of_99_hundredths(apart: float, found: bool) -> None:
-    """Two sines of one band of which one is larger by as much as the other is smaller."""
+    """Of two sines in one band, one is larger and the other smaller, so the mean slope stays at one."""
     theta = slow(1.0, 0.0) + np.cos(4.5 * TURN) + np.cos(6.5 * TURN)
     alpha = slow(1.0, 0.0) + (1 + apart) * np.cos(4.5 * TURN) + (1 - apart) * np.cos(6.5 * TURN)
     assert is_absolute(theta, alpha) == found
@@ -354,7 +362,7 @@ def test_it_follows_with_a_coherence_of_99_hundredths(apart: float, found: bool)
 
 @pytest.mark.parametrize(("size", "found"), [(0.0030, False), (0.0034, True)])
 def test_slow_motion_is_three_thousandths_of_all(size: float, found: bool) -> None:
-    """Of the transform with low side lobes, in which a sine of amplitude one has 0.95 in its band."""
+    """The share is that of the windowed transform, of which a sine in the first band has only 0.95 there."""
     theta = slow(size, 0.1, np.sqrt(0.99))
     assert is_absolute(theta, theta) == found
     theta = 0.1 * np.cos(TURN) + slow(0.0, 0.95 * size, np.sqrt(0.99))
@@ -382,7 +390,7 @@ def test_what_is_slow_needs_two_samples_in_the_shortest_period(samples: int, fou
 
 
 def test_what_is_exactly_at_a_limit(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Powers of two are exact in every sum: signals are brought to the limits, or limits to the signals."""
+    """Values exactly at a limit; signals or limits are chosen such that sums have no rounding error."""
     y = np.column_stack([WAVE, 0.1 * WAVE[::-1]])
     for samples, short in ((49, True), (50, False)):
         r = Recording(u=U[:samples], y=y[:samples], Ts=TS, accept=quality.ACCEPTABLE)
@@ -390,7 +398,7 @@ def test_what_is_exactly_at_a_limit(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "units voltage" not in kinds(u=100 * U) and np.max(np.abs(100 * U)) == 100.0
     half_turn = np.where(K % 2, 1.0, -1.0) * np.pi
     assert "units alpha" not in kinds(alpha=half_turn)
-    # The speed that a servo may just reach, over one sample of a quarter of a second.
+    # The largest speed that a servo may have, over one sample of a quarter of a second.
     for volts, speed in ((1.0, 60.0), (10.0, 150.0)):
         for more, found in ((0.0, False), (1e-9, True)):
             theta = np.array([0.0, 0.0, 0.25 * speed + more, 0.0])
@@ -399,20 +407,20 @@ def test_what_is_exactly_at_a_limit(monkeypatch: pytest.MonkeyPatch) -> None:
     x = slow(1.0, 1.0)
     monkeypatch.setattr(quality, "SWAPPED_RATIO", 4.0)
     assert not is_swapped(x, 4.0 * x) and is_swapped(x, 4.000001 * x)
-    # As much slow motion as is asked for in one band: the rest is in the other.
+    # The least share of slow motion in one band; the rest is in the other.
     monkeypatch.setattr(quality, "_spectrum", lambda values: np.asarray(values, complex))
     monkeypatch.setattr(quality, "LEAST_SLOW_SHARE", 0.5)
     hub = np.zeros(16)
-    hub[1], hub[4] = 3.0, 4.0  # of length five
+    hub[1], hub[4] = 3.0, 4.0  # norm 5
     monkeypatch.setattr(quality, "LEAST_SLOW_SHARE", 0.6)
     assert not is_absolute(hub, hub)
     monkeypatch.setattr(quality, "LEAST_SLOW_SHARE", 0.59)
     assert is_absolute(hub, hub)
-    # A slope that is off by the tolerance, and one by more.
+    # A slope that differs from one by the tolerance, and one by more.
     monkeypatch.setattr(quality, "SLOW_BANDS", ((1, 4, 0.25), (4, 8, 0.25)))
     assert is_absolute(hub, 1.25 * hub) and not is_absolute(hub, 1.2500001 * hub)
     monkeypatch.setattr(quality, "LEAST_SLOW_SHARE", 0.06)
-    assert not is_swapped(0.1 * hub, hub)  # ten times as much is asked for
+    assert not is_swapped(0.1 * hub, hub)  # ten times this share is required
     monkeypatch.setattr(quality, "LEAST_SLOW_SHARE", 0.059)
     assert is_swapped(0.1 * hub, hub)
     assert not is_absolute(hub, 0.0 * hub)

@@ -20,7 +20,7 @@ def test_the_filter_is_that_of_scipy_to_rounding_also_at_the_ends(
     found = smoothed(y, width, degree, derivative, 0.002)
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-11 * np.abs(expected).max())
     weights = local_polynomial(width, degree, derivative, 0.002)[width // 2]
-    # Of the same samples in the other order, as a filter takes them.
+    # scipy returns the weights in reverse order, for a convolution.
     expected = np.asarray(scipy.signal.savgol_coeffs(width, degree, **options))[::-1]
     np.testing.assert_allclose(weights, expected, rtol=0, atol=1e-11 * np.abs(expected).max())
 
@@ -32,7 +32,7 @@ def test_a_signal_of_just_one_width_is_one_polynomial() -> None:
 
 
 def test_a_search_does_not_import_scipy_signal() -> None:
-    """Its import takes longer than a fit; where one is needed, `scipy` imports it by itself."""
+    """Its import takes longer than a fit, so it is left to the functions that need it."""
     code = """
 import sys
 import rotflex_jax as rf

@@ -1,4 +1,4 @@
-"""The report: complete, self-contained, readable, and safe against what users call their files."""
+"""The report: complete, self-contained, readable, and safe with any name that users give to files."""
 
 import base64
 import dataclasses
@@ -83,7 +83,7 @@ def stage(mechanism, test: Recording, error: np.ndarray, free: dict[str, float])
 
 
 def two_rounds() -> Discovery:
-    """Friction and a hardening spring, as if they had been found."""
+    """A constructed result of a search that found friction and a hardening spring."""
     train, test = moved(), moved(1500)
     rng = np.random.default_rng(1)
     noise = NOISE * rng.standard_normal((test.N, 2))
@@ -183,7 +183,7 @@ def nothing() -> Discovery:
 
 
 def one_channel() -> Discovery:
-    """A single inertia in revolutions, nothing ranked, sensor noise unknown."""
+    """Result for a single inertia: angle in revolutions, no ranking, unknown sensor noise."""
     both = moved()
     test = Recording(u=both.u, y=both.y[:, 0], Ts=both.Ts, units=("rev",), source="")
     error = 0.01 * np.sin(test.t)[:, None] + NOISE
@@ -193,7 +193,7 @@ def one_channel() -> Discovery:
 
 
 def photographed() -> LatentTorque:
-    """A friction at the hub less a line, as if a smoother had found it."""
+    """A constructed latent torque: dry friction at the hub less a linear part, almost none at the joint."""
     t = 0.005 * np.arange(1500)
     speed = np.stack([np.sin(t), np.cos(3 * t)], axis=1)
     return LatentTorque(
@@ -214,7 +214,7 @@ def photographed() -> LatentTorque:
 
 
 def map_of_friction(discovery: Discovery, kept: bool) -> LearnedTorqueResult:
-    """A step over the speed, as if it had been learned."""
+    """A constructed learned torque: a step over the speed, less its constant and linear parts."""
     rng = np.random.default_rng(3)
     speed, position = rng.normal(size=4000), rng.uniform(-1, 1, 4000)
     effect = LearnedTorque(at="hub", position=(-1.0, 1.0), speed=(-3.0, 3.0), count=(1, 12))
@@ -246,7 +246,7 @@ def discovery() -> Discovery:
 
 @pytest.fixture
 def undrawn(monkeypatch) -> None:
-    """Pages without figures, which take most of the time."""
+    """Without figures, latent torques and identifiability, which take most of the time of a page."""
     monkeypatch.setattr("rotflex_jax.report.page.pictures", lambda *given: {})
     torques = LatentTorqueComparison(photographed(), None)
     monkeypatch.setattr(Discovery, "latent_torque", lambda self, progress: torques)
@@ -259,7 +259,7 @@ def page(discovery) -> str:
 
 
 class Reader(html.parser.HTMLParser):
-    """Reads a page strictly: every element is closed, in order."""
+    """Strict parser of a page: every element must be closed, in order."""
 
     VOID = ("meta", "img", "br", "link", "input", "hr")
 
@@ -303,7 +303,7 @@ def test_the_page_is_well_formed_and_needs_nothing_else(page) -> None:
     assert reader.addresses
     assert all(a.startswith("data:image/svg+xml;charset=utf-8,") for a in reader.addresses)
     assert not {"link", "iframe", "object"} & set(reader.tags)
-    # A browser refuses whatever a script or a style would fetch.
+    # By this policy a browser refuses everything that a script or a style would load.
     assert re.search(r'<meta http-equiv="Content-Security-Policy" content="default-src \'none\';', page)
     assert "Copyright (c) 2022 Leon Sorokin" in page
     style = re.search(r"<style>(.*)</style>", page, re.DOTALL).group(1)
@@ -401,7 +401,7 @@ def _has_unit(ax, axis) -> bool:
 
 
 def test_the_most_probable_sets_and_effects_are_drawn(discovery) -> None:
-    """Bars of the reported set in its colour; none where one set alone was fitted."""
+    """The bar of the reported set has another colour; there is no figure if only one set was fitted."""
     sets, effects = pictures(discovery)["probabilities"].figure.axes
     assert [b.get_width() for b in sets.patches] == [0.72, 0.2]  # what is below 1 % is left out
     assert [b.get_width() for b in effects.patches] == [0.92, 0.72, 0.2]
@@ -415,7 +415,7 @@ def test_the_most_probable_sets_and_effects_are_drawn(discovery) -> None:
 
 
 def test_errors_after_reversals_are_drawn_to_the_last(discovery) -> None:
-    """What comes later than the last limit, or before the first reversal, has a bar of its own."""
+    """Samples later than the last limit, or before the first reversal, share the last bar."""
     run = turning()
     error = white(run)
     for k in reversals(run):
@@ -455,14 +455,14 @@ def test_the_missing_torque_is_shown_and_what_was_learned(discovery, page, monke
     assert "τ = −0.0300 sign(w)" in text or "τ = −0.03 sign(w)" in text
     assert "98 %" in text and "755 nat" in text
     assert grown.count("<figure>") == page.count("<figure>") + 3
-    monkeypatch.setattr("rotflex_jax.report.page.pictures", lambda *given: {})  # text alone is read below
+    monkeypatch.setattr("rotflex_jax.report.page.pictures", lambda *given: {})  # only text is checked below
     without = read(render(discovery, Explanation(latent, map_of_friction(discovery, False)))).text
     assert "does not make held-out data likelier" in without
     assert "The missing torque" not in read(page).text
 
 
 def test_the_report_says_what_can_be_known(discovery, monkeypatch) -> None:
-    """Of the final model, on the recording that was fitted: what a call of `identifiable` says."""
+    """The report gives the identifiability of the final model; here one common factor is open."""
     monkeypatch.setattr("rotflex_jax.report.page.pictures", lambda *given: {})
     open_scale = paper().release("arm.inertia.inertia")
     last = dataclasses.replace(discovery.rounds[-1].stage, model=Model(open_scale))
@@ -491,7 +491,7 @@ def test_a_map_is_learned_only_where_something_is_unexplained(
     assert not asked and not (tmp_path / "a" / "learned_torque.json").exists()
     dataclasses.replace(discovery, verdict=Verdict.UNEXPLAINED).report(tmp_path / "b")
     discovery.report(tmp_path / "c", learned=True)
-    # Where most is left.
+    # At the port where most torque is missing.
     assert asked == ["hub", "hub"]
     for folder in ("b", "c"):
         taught = json.loads((tmp_path / folder / "learned_torque.json").read_text(encoding="utf-8"))
@@ -504,7 +504,7 @@ def test_the_folder_is_made_and_holds_page_and_json(discovery, undrawn, tmp_path
     assert read(path.read_text(encoding="utf-8")).text
     text = (path.parent / "result.json").read_text(encoding="utf-8")
     assert json.loads(text) == discovery.to_dict()
-    write_report(discovery, path.parent)  # again, over what is there
+    write_report(discovery, path.parent)  # again, over the existing files
 
 
 def test_a_file_is_not_taken_for_a_folder(discovery, undrawn, tmp_path) -> None:
@@ -544,7 +544,7 @@ def test_tables_for_a_terminal(discovery) -> None:
 
 
 def validated(discovery: Discovery, test: Recording) -> Discovery:
-    """The same with another validation recording, whose errors are noise with one peak."""
+    """The same result with another validation recording, whose errors are noise with one peak."""
     rng = np.random.default_rng(2)
     error = 0.01 * rng.standard_normal(test.y.shape)
     error[test.N // 3, 0] = PEAK
@@ -569,7 +569,7 @@ def numbers(text: str) -> np.ndarray:
 
 
 def test_figures_to_zoom_hold_every_sample_of_a_common_recording(discovery) -> None:
-    """20 s at 500 Hz: the page is small, has the overlay as it was measured, and its still picture."""
+    """With 20 s at 500 Hz the page is below 3 MB and has every sample; each figure has a still picture."""
     found = validated(discovery, moved(10_000, 0.002))
     page = render(found)
     assert len(page) < 3e6
@@ -602,7 +602,7 @@ def test_long_recordings_keep_the_page_small_and_show_every_peak(discovery) -> N
     assert x["step"] * (len(error) - 1) == pytest.approx(120.0, abs=0.02)
 
 
-# Keys, a button, mouse, wheel and a finger; then a drag over a map.
+# A script that zooms with keys, a button, mouse, wheel and touch; then it drags over a map.
 EXERCISE = """
 const ranges = [], [over, map] = document.querySelectorAll("figure.zoomable");
 const note = (f) => ranges.push(f.zoom.visible.range);
@@ -678,7 +678,7 @@ def test_a_browser_shows_the_page_without_complaint(page, tmp_path) -> None:
         assert found == pytest.approx([low + s * (high - low) for s in shares], abs=0.02 * (high - low))
     picture = image.imread(shot)
     assert picture.shape[:2] == (2400, 1000)
-    # Text and figures: many tones, in the lower half (where the figures are) too.
+    # Both halves have many colours; the figures are in the lower half.
     for half in (picture[:1200], picture[1200:]):
         assert len(np.unique(half[..., :3].reshape(-1, 3).round(2), axis=0)) > 100
 
@@ -690,7 +690,7 @@ def printed(discovery: Discovery, monkeypatch, capsys) -> str:
 
 
 def test_parameters_are_those_of_the_model_to_use(discovery, undrawn, monkeypatch, capsys) -> None:
-    """The interval in which a round found an effect need not hold what the final model says."""
+    """A value of the final model may lie outside the interval of the round that found the effect."""
     final = discovery.final
     moved = tuple(
         dataclasses.replace(e, value=0.0312, ci95=(0.0311, 0.0313)) if e.name == "hub.coulomb.level" else e

@@ -1,4 +1,4 @@
-"""The paper's experiment: its settings, its laws, and the command from end to end."""
+"""The paper's experiment: its settings, its predictions, and the command from end to end."""
 
 import dataclasses
 import json
@@ -51,7 +51,7 @@ def test_every_setting_says_where_it_comes_from_and_why() -> None:
     rows = Settings.table()
     assert {row["source"] for row in rows} == {"paper", "assumption", "numerics"}
     assert all(len(row["why"]) > 10 or row["source"] == "paper" for row in rows)
-    # What the paper does not give must not pass for the paper's.
+    # Settings that the paper does not give must be marked as assumptions.
     open_questions = {
         "Ts",
         "filter",
@@ -149,7 +149,7 @@ def test_autocovariance_of_the_butterworth_filter_is_that_of_its_spectrum() -> N
     np.testing.assert_allclose(sources.autocovariance(s, 8), np.array(expected) / expected[0], atol=1e-6)
 
 
-# What a memory can hold -----------------------------------------------------------------------------
+# Least error of a short memory ----------------------------------------------------------------------
 
 
 def test_least_error_of_five_samples_has_its_tabulated_values() -> None:
@@ -165,7 +165,7 @@ def test_least_error_of_five_samples_has_its_tabulated_values() -> None:
 
 
 def test_eigenvalue_of_white_input_is_two_for_a_square_and_one_for_a_product() -> None:
-    s = Settings(cutoff=1e3)  # next to white
+    s = Settings(cutoff=1e3)  # nearly white
     basis = Volterra(Delays(5))
     theory = moments(s, basis, simulated(dataclasses.replace(s, **(SHORT | {"runs": 1}))))
     square, product = (watched_index(Settings(coefficient=lags), basis) for lags in ((1, 1), (1, 2)))
@@ -212,7 +212,7 @@ def test_orthogonalised_regressors_lead_to_the_same_kernels(transform: str) -> N
     assert found.mean_path[-1] == pytest.approx(found.target, rel=0.01)
 
 
-# What a quadratic kernel cannot see -----------------------------------------------------------------
+# Friction without a quadratic kernel ----------------------------------------------------------------
 
 
 def test_symmetric_friction_has_no_quadratic_kernel_and_an_offset_has() -> None:
@@ -237,7 +237,7 @@ def test_linearised_joint_on_the_pulse_of_the_symmetric_machine() -> None:
     s = Settings(scenario="S1", Ts=0.01, samples=200, held_out=200, runs=1, step=5e-4)
     row = linearised(simulated(s))
     assert row.pulses[0] == pytest.approx(0.0570, abs=2e-4)
-    assert row.pulses[0] == pytest.approx(row.pulses[1], rel=1e-9)  # the machine is odd
+    assert row.pulses[0] == pytest.approx(row.pulses[1], rel=1e-9)  # a symmetric machine
 
 
 def test_within_the_pulse_every_model_of_five_samples_rests_on_its_plateau(short: Reproduction) -> None:
@@ -323,8 +323,8 @@ def test_command_writes_figures_page_and_numbers(
     run: Callable, tmp_path: Path, short: Reproduction, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def known(settings: Settings, *, joint: object, progress: Callable[[str], None]) -> Reproduction:
-        assert settings == short.settings  # the options have arrived
-        assert joint is None  # nothing recorded to compare with
+        assert settings == short.settings  # the options are passed on
+        assert joint is None  # no recording to compare with
         progress("predicted")
         return short
 
@@ -338,7 +338,7 @@ def test_command_writes_figures_page_and_numbers(
     page = (out / "reproduce.html").read_text()
     for text in ("Figure 7.", "Figure 11.", "assumption", "M=5 quadratic, LMS", "linearised joint", "7000"):
         assert text in page
-    rest = page.replace("http://www.w3.org", "")  # names of formats, which nothing fetches
+    rest = page.replace("http://www.w3.org", "")  # names of XML formats, which are not loaded
     assert "http:" not in rest and "https:" not in rest
     assert "M=5 quadratic, LMS" in shown
     assert "predicted" in progress
@@ -365,7 +365,7 @@ def test_recordings_take_the_place_of_the_simulation(run: Callable, tmp_path: Pa
     assert result["data"]["measured"]
     assert "pulse" not in shown.split('"models"')[1].replace('"pulse_nmse": {}', "")
     assert "No pulse was recorded" in (out / "reproduce.html").read_text()
-    # The same thinning by hand: every fifth sample, the voltage its mean, from each of five starts.
+    # The same decimation by hand: every fifth sample and the mean of the voltage, from each of five starts.
     table = np.loadtxt(file, delimiter=",", skiprows=1)
     u, alpha = table[:, 1], table[:, 3]
 
@@ -395,14 +395,14 @@ def test_equations_with_friction_take_their_place_in_the_table(monkeypatch: pyte
     def true_fit(model: Model, parts: list[Recording]) -> SimpleNamespace:
         added = {(e.name, e.at) for e in model.mechanism.effects[-3:]}
         assert added == {("coulomb", "hub"), ("coulomb", "joint"), ("voltage_offset", "input")}
-        assert [part.duration for part in parts] == [pytest.approx(28.0)]  # all of it, before thinning
+        assert [part.duration for part in parts] == [pytest.approx(28.0)]  # all of it, before decimation
         return SimpleNamespace(model=Model(machine, Exponential(substeps=4)))
 
     monkeypatch.setattr("rotflex_jax.reproduce.models.fit", true_fit)
     row = grey_box(records, quiet)
-    # What is left comes from the first state, which is told by ten samples.
+    # The remaining error comes from the first state, which is estimated from ten samples.
     assert row.held_out < 1e-4 < linearised(records).held_out / 100
-    # Both are thinned out as the record is: the outputs lie on the same samples.
+    # Both outputs are decimated like the recording, to the same samples.
     assert [len(y) for y in row.y_hat] == [r.N for r in records.test] == [len(y) for y in records.linearised]
     one = {"channels": ("alpha",), "units": ("rad",), "resolution": {}}
     alone = [dataclasses.replace(r, y=r.y[:, 1:], **one) for r in (train, test)]

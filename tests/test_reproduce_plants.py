@@ -1,4 +1,4 @@
-"""The plants with known faults, against independent integrators and exact properties."""
+"""Plants with known nonlinear effects, against independent integrators and exact properties."""
 
 import json
 from pathlib import Path
@@ -18,7 +18,7 @@ def volts(N: int, seed: int = 0) -> np.ndarray:
 
 
 def test_pulse_response_with_friction_is_that_of_an_independent_integrator() -> None:
-    # Reference: implicit Coulomb time stepping with a step of 5e-6 s, seconds after the pulse began.
+    # Reference: implicit integration with a step of 5e-6 s; keys are seconds since the start of the pulse.
     u = np.zeros(201)
     u[:100] = 2.0
     y = response(plant("S1"), u, 0.01, step=1e-4)
@@ -48,10 +48,10 @@ def test_the_other_plants_are_not(name: str) -> None:
 
 
 def test_unequal_hub_friction_is_equal_friction_and_a_voltage() -> None:
-    # Levels 0.045 and 0.015 are 0.03 both ways and a torque of -0.015 N m, which is a voltage.
+    # Levels 0.045 and 0.015 are 0.03 in both directions and a torque of -0.015 N m, equivalent to a voltage.
     motor = plant("S0").effect("motor", "hub").values
     shift = 0.015 * motor["resistance"] / (motor["torque_constant"] * motor["gear_ratio"])
-    # Without the dead zone, which the voltage would have to pass.
+    # Without the dead zone, which would act on the voltage too.
     equal = plant("S1").without("dead_zone", "input") + VoltageOffset(offset=-shift)
     u = volts(400)
     unequal = response(plant("S3").without("dead_zone", "input"), u, 0.02)
@@ -66,7 +66,7 @@ def test_where_the_arm_rubs_matters_a_little() -> None:
 
 
 def test_series_of_unlike_springs() -> None:
-    # Another route to the same numbers: the slope of the energy, and a polynomial through it.
+    # Reference: the derivative of the energy, and a polynomial fitted to it.
     d, R = 0.75 * 0.0254, 3 * 0.0254
 
     def energy(a: np.ndarray) -> np.ndarray:

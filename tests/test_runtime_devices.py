@@ -1,4 +1,4 @@
-"""Rows spread over devices and processes: the same numbers, each device its share."""
+"""Rows spread over devices and processes: the results are the same, and each device computes its share."""
 
 import json
 import os
@@ -20,7 +20,7 @@ ROWS = 11
 
 
 def run(program: str, *arguments: object) -> subprocess.Popen:
-    """A program in a process of its own, since the number of devices holds for a whole process."""
+    """Start a program in a new process, since the number of devices is fixed for a process."""
     line = [sys.executable, str(HERE / program), *map(str, arguments)]
     return subprocess.Popen(line, env=SURROUNDINGS, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
@@ -59,14 +59,14 @@ def test_fits_on_two_devices_end_where_those_on_one_do() -> None:
     found = said(run("fits_on_devices.py"))
     assert (found["devices"], found["waits"]) == ([2], [])
     for what in ("values", "std", "costs", "cut"):
-        # An offset that is zero but for the noise has fewer digits: sums are added up in another order.
+        # Sums are computed in another order: an offset that is zero up to the noise has fewer equal digits.
         np.testing.assert_allclose(
             found["two"][what], found["one"][what], rtol=1e-7, atol=1e-10, err_msg=what
         )
 
 
 def test_the_suite_itself_runs_on_one_device() -> None:
-    """Programs for several devices change that for a whole process, so they must not run when collected."""
+    """Programs for several devices set their number for the process, so they must not run when collected."""
     assert len(jax.local_devices()) == 1
 
 

@@ -1,4 +1,4 @@
-"""Programs on disk: found again by another process, and only where nothing they depend on differs."""
+"""Compiled programs on disk: another process loads them, but only if nothing on which they depend differs."""
 
 import dataclasses
 import gc
@@ -46,7 +46,7 @@ traced = []
 
 
 def new() -> PersistentJit:
-    """The program of one function as a new process has it: nothing of it in memory."""
+    """A `PersistentJit` as in a new process: none of its programs is in memory."""
 
     def line(slope: float, x: jax.Array) -> jax.Array:
         traced.append(slope)
@@ -96,7 +96,7 @@ def test_a_second_process_does_not_trace(folder: Path) -> None:
 
 
 class Held:
-    """A program whose tracing waits, and fails the first time if asked to."""
+    """A program whose tracing waits until `go` is set; if `fails`, the first tracing raises an error."""
 
     def __init__(self, fails: bool = False) -> None:
         self.begun, self.go, self.threads = threading.Semaphore(0), threading.Event(), []
@@ -122,10 +122,10 @@ def test_a_program_that_two_threads_need_is_made_by_one(folder: Path, fails: boo
         first = pool.submit(held.program, 2.0, X)
         assert held.begun.acquire(timeout=30.0)
         second = pool.submit(held.program, 2.0, X)
-        assert not held.begun.acquire(timeout=0.3)  # it waits
+        assert not held.begun.acquire(timeout=0.3)  # the second thread waits
         held.go.set()
         np.testing.assert_array_equal(second.result(30.0), 2 * X)
-        if fails:  # then the one that has waited makes it
+        if fails:  # then the waiting thread makes the program
             with pytest.raises(ValueError, match="first"):
                 first.result(30.0)
         else:
@@ -141,7 +141,7 @@ def test_a_program_made_ahead_is_there_when_it_is_needed(folder: Path) -> None:
     np.testing.assert_array_equal(held.program(2.0, X), 2 * X)
     none_left()
     assert len(held.threads) == 1 and held.threads[0].startswith("programs")
-    make_ahead(lambda: beyond.append(held.program(2.0, X)))  # there is nothing to make
+    make_ahead(lambda: beyond.append(held.program(2.0, X)))  # already in memory, so the call ends early
     make_ahead(lambda: beyond.append(held.program(3.0, X)))
     none_left()
     np.testing.assert_array_equal(beyond, [3 * X])
@@ -152,7 +152,7 @@ def test_a_program_made_ahead_is_there_when_it_is_needed(folder: Path) -> None:
 def test_garbage_is_not_searched_for_while_programs_are_made(
     folder: Path, monkeypatch: pytest.MonkeyPatch, kept: bool, was_on: bool
 ) -> None:
-    """By several threads, of which one fails; what the user had set is back afterwards."""
+    """Several threads make programs, and one fails; afterwards the setting of the user holds again."""
     seen: list[bool] = []
     if not kept:
         monkeypatch.setattr(persistent_jit, "programs_folder", lambda: None)
@@ -194,7 +194,7 @@ def test_what_differs_is_another_program(folder: Path) -> None:
         program(2.0, np.arange(3.0))
         program(2.0, np.arange(4.0))
         program(3.0, np.arange(3.0))
-        assert program(2.0, np.arange(3.0) + 1)[0] == 2.0  # other values are not
+        assert program(2.0, np.arange(3.0) + 1)[0] == 2.0  # other values need no other program
     single = program(2.0, np.arange(3, dtype=np.float32))
     assert single.dtype == np.float32
     assert traced == [2.0, 2.0, 3.0, 2.0] and len(files(folder)) == len(program) == 4
@@ -211,13 +211,13 @@ def test_programs_are_counted_and_one_that_is_loaded_runs_once(
         return lambda *leaves: (runs.append(leaves), program(*leaves))[1]
 
     monkeypatch.setattr(serialize_executable, "deserialize_and_load", watched)
-    # A slope of its own: what JAX has compiled before it loads from its own cache, and cannot be stored.
+    # No other test has this slope: a program that JAX loads from its own cache cannot be stored.
     for program in (new(), new()):
         for _ in range(3):
             np.testing.assert_array_equal(program(7.25, x), 7.25 * x)
     found = program_counts()
     assert (found.compiled - before.compiled, found.loaded - before.loaded) == (1, 1)
-    assert found.seconds > before.seconds and len(runs) == 3  # one of them to see whether it can
+    assert found.seconds > before.seconds and len(runs) == 3  # the first run checks the program
 
 
 @pytest.fixture
@@ -236,7 +236,7 @@ def loads(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, str]]:
 def test_programs_of_the_last_block_alike_are_loaded_on_threads(
     folder: Path, loads: list[tuple[str, str]]
 ) -> None:
-    # Slopes of their own: what JAX has compiled before cannot be stored.
+    # No other test has these slopes: a program that JAX loads from its own cache cannot be stored.
     slopes, first = (6.125, 5.125, 4.125), new()
     with loaded_ahead("a search", (1, 2)):
         for slope in slopes:
@@ -255,10 +255,10 @@ def test_programs_of_the_last_block_alike_are_loaded_on_threads(
     assert len(loads) == 3 and {thread for thread, _ in loads} == {"loading"}
     loads.clear()
     second.release_programs()
-    with loaded_ahead("a search", (1, 2)):  # no second time in a process
+    with loaded_ahead("a search", (1, 2)):  # only the first such block of a process loads
         assert not persistent_jit._coming
     release_programs()
-    with loaded_ahead("a search", (1, 2)):  # nothing was used inside of the last one
+    with loaded_ahead("a search", (1, 2)):  # the last such block used no programs
         assert not persistent_jit._coming
     assert not loads
 
@@ -353,7 +353,7 @@ def test_what_was_not_used_for_long_is_deleted_first(folder: Path) -> None:
 
 
 def test_a_program_with_linear_algebra_runs_in_a_process_that_has_compiled_none(tmp_path: Path) -> None:
-    """Such a program calls a library, which JAX prepares only when it compiles a call of it."""
+    """Such a program calls a library that JAX registers only when it lowers a call of it."""
     code = """
 import sys, json, numpy as np, jax.numpy as jnp
 from rotflex_jax.runtime import persistent_jit
@@ -425,7 +425,7 @@ print("XLA_FLAGS" in os.environ)
 
 @pytest.mark.parametrize("when", ["last", "first"])
 def test_loops_are_fast_unless_jax_has_started_before(when: str) -> None:
-    """Then they are what this JAX makes of them by itself; newer ones compile small loops as we ask for."""
+    """If JAX has started before, its own default holds; newer versions fuse small loops by default."""
     clean = {k: v for k, v in os.environ.items() if k != "XLA_FLAGS"}
     run = subprocess.run(
         [sys.executable, "-c", LOOPS, when], capture_output=True, text=True, check=True, env=clean
@@ -456,7 +456,7 @@ def test_the_text_of_a_structure_identifies_it() -> None:
     texts = [static_key(m.structure) for m in mechanisms]
     assert all(texts) and len(set(texts)) == len(texts)
     numbers = joint.with_values(2 * joint.values)
-    assert static_key(numbers.structure) == texts[0]  # the numbers are no part of it
+    assert static_key(numbers.structure) == texts[0]  # the text does not depend on values of parameters
     assert static_key(Exponential(order=2)) != static_key(Exponential(order=4))
 
 
@@ -523,7 +523,7 @@ def test_a_compiler_without_these_choices_compiles_as_it_likes(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     wished, known = persistent_jit._FOR_COMPILER, persistent_jit._options()
-    assert known and known.items() <= wished.items()  # XLA drops a choice now and then
+    assert known and known.items() <= wished.items()  # a version of XLA may have removed an option
     monkeypatch.setattr(persistent_jit, "_FOR_COMPILER", {"xla_no_such_option": False, **wished})
     persistent_jit._options.cache_clear()
     assert persistent_jit._options() == known

@@ -1,4 +1,4 @@
-"""Calls side by side on threads."""
+"""Parallel calls on threads."""
 
 import threading
 import time
@@ -15,7 +15,7 @@ def test_results_come_in_the_order_of_the_jobs():
 
 
 def test_calls_from_within_calls_end_though_all_threads_are_busy():
-    """Each outer call waits for its inner ones: these must not wait for a thread that an outer one holds."""
+    """Each outer call waits for its inner ones, which therefore must not need a thread of their own."""
     found = []
 
     def outer(k):
@@ -24,7 +24,7 @@ def test_calls_from_within_calls_end_though_all_threads_are_busy():
     def several():
         found.extend(on_threads(outer, range(4 * cores())))
 
-    # Not on the threads themselves: where they wait for ever, the test fails instead of hanging.
+    # On a separate thread, so that the test fails and does not hang if the threads wait for each other.
     caller = threading.Thread(target=several, daemon=True)
     caller.start()
     caller.join(timeout=30)
@@ -46,7 +46,7 @@ def test_an_error_is_raised_once_what_has_begun_has_ended():
 
 
 def test_what_has_begun_stops_at_its_next_call_from_within() -> None:
-    """A fit of many runs does not go on to its end after the user has stopped the search."""
+    """A long fit does not run to its end after the user has stopped the search."""
     begun, steps = threading.Event(), []
 
     def run(k):

@@ -1,4 +1,4 @@
-"""The simulator against the paper's numbers, closed forms, symmetries and an exact integration.
+"""The simulator against values of the paper's joint, closed forms, symmetries and an exact integration.
 
 `paper_numbers.json` holds reference values of the joint with the paper's parameters to 16 digits;
 two independent integrators agree on them. `sticking.py` is the exact integration.
@@ -32,7 +32,7 @@ LOCKED = np.sqrt(K / J_ARM)  # 16.519 rad/s, the arm on a hub that does not move
 
 
 def noise(N: int, seed: int = 1, hold: int = 5, size: float = 1.0) -> np.ndarray:
-    """A random staircase [V]."""
+    """A random piecewise constant voltage [V]."""
     rng = np.random.default_rng(seed)
     return size * np.repeat(rng.normal(size=N // hold + 1), hold)[:N]
 
@@ -72,7 +72,7 @@ def test_equations_of_motion():
 
 @pytest.mark.parametrize("Ts", [0.001, 0.01, 0.02, 0.05, 0.1])
 def test_zero_order_hold(Ts):
-    """The step of the simulator, read off column by column, is the tabulated one."""
+    """Matrices of the discrete-time system, from the simulator column by column, equal tabulated ones."""
     step = functools.partial(simulate_states, paper(), Ts=Ts)
     Ad = np.stack([step(np.zeros(2), x0=column)[1] for column in np.eye(4)], axis=1)
     Bd = step(np.ones(2))[1]
@@ -93,7 +93,7 @@ def test_step_samples(Ts):
 
 
 def test_motor_current_is_exact_at_any_step():
-    """The electrical pole at -14391 1/s is carried by steps of 10 ms."""
+    """With an electrical pole at -14391 1/s, steps of 10 ms are exact; reference: a matrix exponential."""
     joint = paper(inductance=0.18e-3)
     u, Ts = noise(100), 0.01
     space = linearise(joint)
@@ -122,7 +122,7 @@ def test_single_precision_stays_single_and_close():
 
 
 def test_a_delay_within_the_sample_is_that_of_the_switched_linear_system():
-    """The voltage switches within each sample; matrix exponentials of both parts."""
+    """The voltage switches within each sample; reference: matrix exponentials of both parts of it."""
     joint, Ts, late, N = paper(hub_damping=0.01), 0.004, 0.0013, 200
     space, u = linearise(joint), np.sign(np.random.default_rng(2).standard_normal(N))
     A = np.pad(np.column_stack([space.A, space.B]), ((0, 1), (0, 0)))
@@ -149,7 +149,7 @@ def test_a_delay_within_the_sample_is_that_of_the_switched_linear_system():
 
 
 def test_a_switched_voltage_is_refused_beside_what_sticks():
-    """Only where both are on: models of several rivals have gates."""
+    """It is refused only if the gates of both effects are on."""
     solver, late = Exponential(between="switched"), paper() + fx.Delay(time=1e-3)
     both = late + fx.Coulomb("hub")
     with pytest.raises(InputError, match="input delay and Coulomb friction"):
@@ -162,7 +162,7 @@ def test_a_switched_voltage_is_refused_beside_what_sticks():
 
 
 def test_odd_symmetry_is_exact():
-    """Symmetric friction, dead zone and springs turn -u into -y."""
+    """With symmetric friction, dead zone and springs, the input -u gives exactly the output -y."""
     joint = with_all(
         paper(),
         fx.Coulomb("hub", 0.03),
@@ -213,7 +213,7 @@ def test_asymmetric_arm_friction_is_both():
 
 
 def locked_ringing(t: np.ndarray, start: float, level: float) -> np.ndarray:
-    """Deflection of an arm with Coulomb friction on a hub that holds, released at rest."""
+    """Deflection of an arm with Coulomb friction at the joint, released at rest while the hub sticks."""
     stuck, half = level / K, np.pi / LOCKED
     amplitudes = start - 2 * stuck * np.arange(100)
     last = int(np.argmax(amplitudes <= stuck))
@@ -224,7 +224,7 @@ def locked_ringing(t: np.ndarray, start: float, level: float) -> np.ndarray:
 
 @pytest.mark.parametrize(("Ts", "close"), [(0.01, 5e-5), (0.0025, 3e-6), (0.001, 5e-7)])
 def test_locked_ringing(Ts, close):
-    """While the hub holds, the arm rings at 16.519 rad/s and loses 2 level / K a half cycle."""
+    """While the hub sticks, the arm oscillates at 16.519 rad/s and loses 2 level / K per half cycle."""
     joint = paper() + fx.Coulomb("hub", 0.03) + fx.Coulomb("joint", 0.003)
     t = np.arange(0, 1.3, Ts)
     states = simulate_states(joint, np.zeros_like(t), Ts, x0=np.array([0, 0.0175, 0, 0]))
@@ -266,7 +266,7 @@ def test_breakaway_voltage(also):
     ids=["two", "three", "stribeck", "with smooth torques"],
 )
 def test_stuck_does_not_creep(friction):
-    """Ten seconds under a load within the levels: not a trace of motion."""
+    """Under a load within the levels of friction nothing moves in ten seconds."""
     joint = with_all(paper(), *friction)
     start = np.array([0.3, 0.0012, 0.0, 0.0])
     states = simulate_states(joint, np.full(2500, 0.04), 0.004, x0=start)
@@ -324,20 +324,20 @@ def test_step_converges_to_true_sticking(case):
     mine, exact = FRICTION[case]
     u, Ts = noise(250), 0.004
     expected = Joint(tuple(exact)).run(u, Ts)
-    assert (expected[:, 2] == 0).any() or case == "arm"  # it does stick
+    assert (expected[:, 2] == 0).any() or case == "arm"  # it sticks
     joint = with_all(paper(), *mine)
     errors = [
         np.abs(simulate(joint, u, Ts, solver=Exponential(substeps=n)) - expected[:, :2]).max()
         for n in (1, 16)
     ]
-    assert errors[0] < 6e-4  # half of an encoder count at one step a sample
+    assert errors[0] < 6e-4  # less than half an encoder count, with one step per sample
     assert errors[1] < 3e-6
-    assert errors[1] < errors[0] / 50  # a first-order rule would gain 16
+    assert errors[1] < errors[0] / 50  # a first-order method would gain a factor of 16
 
 
 @pytest.mark.parametrize("case", ["hub", "hub and joint"])
 def test_motion_is_continuous_in_the_friction_level(case):
-    """No jump as sticks and reversals move from sample to sample, since fits go through them."""
+    """The motion does not jump where sticking or a reversal moves to another sample; fits rely on this."""
     joint = with_all(paper(), *FRICTION[case][0])
     at = joint.parameter_names.index("hub.coulomb.level")
     u, N = noise(300, seed=0), 1000
@@ -352,7 +352,7 @@ def test_motion_is_continuous_in_the_friction_level(case):
 
         levels = jnp.linspace(0.03, 0.0306, N)
         moved = np.diff(np.asarray(jax.jit(jax.vmap(theta))(levels)), axis=0)
-    assert np.abs(moved).max() < 1e-5  # the whole range moves it by N times less than a millirad
+    assert np.abs(moved).max() < 1e-5  # for one of N - 1 equal steps of the level
     assert np.abs(np.diff(moved, axis=0)).max() < 2e-7
 
 
@@ -385,7 +385,7 @@ def smooth_torques(q, w):
 
 @pytest.mark.parametrize(("order", "close"), [(2, 2e-4), (4, 5e-6)])
 def test_smooth_torques_converge_at_their_order(order, close):
-    # One long push: the drag has a kink at rest, which no rule of high order likes.
+    # A constant voltage: the drag has a kink at speed zero, at which high-order methods lose accuracy.
     u, Ts, start = np.full(100, 1.0), 0.008, np.array([0.1, 0.08, 1.0, 0.5])
     expected = Joint(extra=smooth_torques).run(u, Ts, start)[:, :2]
     joint = with_all(paper(), *SMOOTH)
@@ -460,7 +460,7 @@ def test_without_input_no_passive_effect_adds_energy(law):
     start = np.array([0.0, 0.08, 1.5, -2.0])
     s = simulate_states(joint, np.zeros(1000), 0.001, x0=start)
     E = J_HUB / 2 * s[:, 2] ** 2 + J_ARM / 2 * (s[:, 2] + s[:, 3]) ** 2 + K / 2 * s[:, 1] ** 2
-    if law.func in (fx.Dahl, fx.LuGre, fx.BoucWen):  # the bristles store some
+    if law.func in (fx.Dahl, fx.LuGre, fx.BoucWen):  # the bristles store energy
         E = E + 0.01 * 0.005 / 2 * np.sum(s[:, 4:] ** 2, axis=1)
     assert E[-1] < 0.9 * E[0]
     assert np.diff(E).max() < 1e-7 * E[0]
@@ -497,12 +497,12 @@ def test_cogging_keeps_energy(order, close):
 
 
 def test_a_loose_joint_coasts_within_its_play_and_swings_beyond():
-    """Period 2 pi / w + 4 play / speed: half a swing on each edge, two flights across."""
+    """Closed form: half an oscillation at each edge, two free flights; period 2 pi / w + 4 play / speed."""
     play, speed = 0.006, 0.4
     joint = paper(back_emf=0.0, torque_constant=0.0) + fx.JointPlay("joint", play, K)
     still = simulate_states(joint, np.zeros(200), 0.004, x0=np.array([0.0, 0.9 * play, 0.0, 0.0]))
     assert np.abs(still - still[0]).max() < 1e-13
-    # Hub and arm part so that their centre rests; the joint then feels the reduced inertia.
+    # The momenta of hub and arm are opposite, so the joint oscillates with the reduced inertia.
     reduced = J_HUB * J_ARM / (J_HUB + J_ARM)
     hub = -speed * J_ARM / (J_HUB + J_ARM)
     t = np.arange(400) * 0.001
@@ -524,7 +524,7 @@ def test_a_loose_joint_coasts_within_its_play_and_swings_beyond():
 
 # -- derivatives --------------------------------------------------------------------------------
 
-# Together they hold every effect of the catalogue.
+# Together they contain the effects of the catalogue, except those whose derivatives are tested elsewhere.
 LADEN = {
     "smooth": [
         *SMOOTH,
@@ -574,9 +574,9 @@ LADEN = {
     ],
     "loaded motor": [fx.GearFriction("hub", 0.01, 0.2), fx.TorqueSaturation("hub", 0.5)],
 }
-# Each program runs a few times, so time spent on making it fast is lost.
+# Each program runs only a few times, so its optimisation would take longer than it saves.
 ROUGH = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
-# Cases whose derivatives are taken both ways: reverse mode is slow to compile, and `memory` has friction.
+# Cases with derivatives in reverse mode too, which is slow to compile; `memory` has dry friction.
 BACKWARD = {"smooth", "memory"}
 
 
@@ -585,7 +585,7 @@ class Laden:
 
     def __init__(self, case: str) -> None:
         self.case = case
-        # Three contacts that may all stick are slow to differentiate as a whole.
+        # The derivatives of three contacts that may all stick are slow to compute.
         self.N = 40 if case == "dry" else 120
         given = {"inductance": 0.18e-3} if case == "smooth" else {}
         self.added = LADEN[case]
@@ -608,7 +608,7 @@ class Laden:
 
 @pytest.fixture(scope="module", params=LADEN)
 def laden(request) -> Laden:
-    """A case; tests of one case follow on each other, so that a worker compiles it once."""
+    """A case; the tests of a case run one after another, so that a worker compiles it once."""
     with double_precision():
         return Laden(request.param)
 
@@ -621,7 +621,7 @@ def test_derivatives_of_a_trajectory_equal_central_differences(laden):
         weights = jnp.asarray(np.random.default_rng(0).normal(size=forward.shape[:2]))
         backward = laden.backward(values, gates, u, x0, weights)[0] if laden.case in BACKWARD else None
         for i, name in enumerate(laden.joint.parameter_names):
-            # A step small enough that no stick or reversal moves to another sample.
+            # A step so small that no start of sticking and no reversal moves to another sample.
             h = 1e-6 * abs(float(values[i]))
             plus, minus = (np.asarray(laden.run(values.at[i].add(s * h), gates, u, x0)) for s in (1, -1))
             expected = (plus - minus) / (2 * h)
@@ -635,15 +635,15 @@ def test_derivatives_of_a_trajectory_equal_central_differences(laden):
 
 def test_every_effect_has_its_derivatives_checked():
     used = {e.name for effects in LADEN.values() for e in effects} | {"inertia", "motor", "current_drive"}
-    # Play has no slope at a gap of zero; its own tests hold where it has one. Readings need outputs of their
-    # own: `test_effects_servo_loop.py`; a signal, columns: `test_effects_signals.py`.
+    # Play has no derivative at a gap of zero; its own tests check it elsewhere. Readings of the motor need
+    # other outputs (`test_effects_servo_loop.py`), a signal needs a column (`test_effects_signals.py`).
     elsewhere = {"backlash", "elastic_backlash", "pid_servo", "current_meter", "duty_meter"}
     elsewhere |= {"measured_disturbance"}
     assert used | elsewhere == set(fx.CATALOG)
 
 
 def test_no_derivative_is_nan_at_rest_or_where_effects_are_absent(laden):
-    """All amplitudes and gates at zero, nothing moves; then the voltage sits on the kinks."""
+    """With amplitudes and gates at zero and nothing in motion, and with voltages at kinks of the effects."""
     absent = [e.replace(**dict.fromkeys(e.amplitudes, 0.0)) for e in laden.joint.effects[laden.first :]]
     bare = with_all(paper(**({"inductance": 1e-4} if laden.case == "smooth" else {})), *absent)
     kinks = np.resize([0.0, 0.15, -0.1, 1.2, -1.2, 0.0, 0.0], laden.N)
@@ -660,7 +660,7 @@ def test_no_derivative_is_nan_at_rest_or_where_effects_are_absent(laden):
 
 
 def test_the_first_trace_of_an_effect_shows_in_the_derivative(laden):
-    """At gate zero the slope is that of a small gate: what a score test stands on."""
+    """At gate zero the derivative equals the difference quotient of a small gate; score tests rely on it."""
     with double_precision():
         u, x0, h = jnp.asarray(noise(laden.N, seed=4)), jnp.zeros(4), 1e-5
         values = jnp.asarray(laden.joint.values)

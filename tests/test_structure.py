@@ -1,4 +1,4 @@
-"""The architecture that docs/design.md draws is the one that the code has."""
+"""The code has the architecture that docs/design.md describes."""
 
 import re
 import sys
@@ -32,7 +32,7 @@ def test_only_the_result_of_a_search_imports_upwards() -> None:
 
 
 def test_import_circles_are_small_and_stay_within_a_folder(package: Package) -> None:
-    """Imports inside functions and for type checking count, but for the one arrow that points up."""
+    """Imports inside functions and for type checking count, except the one import of a higher layer."""
     graph = package.graph(origin=True)
     up = {name for name in graph if name.startswith("rotflex_jax.report")}
     circle = largest_circle(
@@ -43,13 +43,13 @@ def test_import_circles_are_small_and_stay_within_a_folder(package: Package) -> 
 
 
 def test_no_class_is_defined_twice(package: Package) -> None:
-    """The simulator of the arena has words of its own: it shares nothing with the package."""
+    """Except in the simulator of the arena, which may repeat a name, because it shares no code."""
     twice = repeated(package)["classes"]
     assert {k for k, v in twice.items() if sum(".arena.simulator." not in m for m in v) != 1} == set()
 
 
 def test_the_arena_simulator_imports_nothing_of_the_package(package: Package) -> None:
-    """Data made by the model that explains them would prove nothing."""
+    """Data from the model that is tested on them would prove nothing."""
     home = "rotflex_jax.arena.simulator"
     files = {name: m for name, m in package.modules.items() if name.startswith(home)}
     assert len(files) > 10

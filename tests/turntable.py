@@ -1,8 +1,8 @@
-"""A machine of somebody's own, by a simulator of its own: nothing here comes from the toolkit.
+"""Independent simulator of a turntable, a machine of a user; it imports nothing of the toolkit.
 
 A motor turns a platter through a belt. An encoder sits on the motor; a frequency-to-voltage converter
-reads the speed of the platter, without its sign. Hidden in it: dry friction of the platter's bearing that
-truly sticks, and a magnetic brake.
+measures the speed of the platter, without its sign. Hidden effects are dry friction in the bearing of the
+platter, with true sticking, and a magnetic brake.
 
     python tests/turntable.py FILE    # writes the recording of the notebook
 """
@@ -15,14 +15,14 @@ import numpy as np
 
 
 class Truth(NamedTuple):
-    """Numbers of the machine, in SI units."""
+    """Parameters of the machine, in SI units."""
 
     motor_inertia: float = 0.002
     platter_inertia: float = 0.006
     belt: float = 6.0
     belt_damping: float = 0.004
     torque_per_volt: float = 0.075
-    back_emf: float = 0.01125  # torque per speed that the motor's own circuit takes
+    back_emf: float = 0.01125  # braking torque per speed, by the back-EMF
     motor_damping: float = 0.002
     friction: float = 0.0
     brake: float = 0.0
@@ -69,7 +69,7 @@ FOR_THE_NOTEBOOK = Truth(friction=0.03, brake=0.03)
 
 
 def write(path: str) -> None:
-    """The recording of the notebook."""
+    """Write the recording of the notebook."""
     u, y = record(1, FOR_THE_NOTEBOOK)
     table = np.column_stack([0.004 * np.arange(len(u)), u, y])
     np.savetxt(path, table, delimiter=",", header="t,voltage,encoder,tacho", comments="", fmt="%.6g")
