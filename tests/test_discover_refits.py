@@ -45,9 +45,10 @@ def test_a_model_with_one_more_effect_fits_no_worse(fitted: Fitted, location, si
     At a size of zero the model is the baseline, so the likelihood at the optimum is no lower.
     """
     start = CandidateStart(location, np.array(size), expected_gain=5.0)
-    assert fitted.problem.log_likelihoods([with_candidate(fitted.supermodel, fitted.baseline, start, 1.0)]) < (
-        fitted.baseline.log_likelihood - 1000
+    (at_start,) = fitted.problem.log_likelihoods(
+        [with_candidate(fitted.supermodel, fitted.baseline, start, 1.0)]
     )
+    assert at_start < fitted.baseline.log_likelihood - 1000
     (grown,) = refit_candidates(fitted.problem, fitted.baseline, [start])
     gain = grown.log_likelihood - fitted.baseline.log_likelihood
     # The fit ends where a step gains less than 0.3 nat. Two further parameters gain about one nat by chance.

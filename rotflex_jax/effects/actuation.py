@@ -63,12 +63,12 @@ class Saturation(Actuation):
 
         v -> min(max(v, -limit), limit)
 
-    Inactive only at an infinite limit, so it has no amplitude; a limit above the largest recorded
-    voltage has no effect. Not for a voltage that was recorded after the limit.
+    Inactive only at an infinite limit, so it has no amplitude; a limit above the largest recorded voltage has
+    no effect. Not for a voltage that was recorded behind the amplifier, where it is already limited.
 
     Args:
         at: Always `input`.
-        limit: Largest voltage [V].
+        limit: Largest magnitude of the voltage [V].
 
     Source: Quanser, SRV02 user manual, 2011 (5 V through the cable of gain 1).
     """
@@ -107,7 +107,7 @@ class AmplifierSaturation(Actuation):
 
     Args:
         at: Always `input`.
-        limit: Voltage that the output approaches [V].
+        limit: Magnitude that the output approaches [V].
 
     Source: H. K. Khalil, Nonlinear Systems, 3rd ed., 2002, section 1.2.7.
     """
@@ -142,8 +142,8 @@ class VoltageOffset(Actuation):
 
         v -> v + offset
 
-    Without other nonlinearities it is equivalent to a constant torque at the motor's port. It drifts, so
-    each recording may need its own offset.
+    Where amplifier and motor are otherwise linear, it is equivalent to a constant torque at the motor's port.
+    An offset changes slowly with time, so each recording may need its own.
 
     Args:
         at: Always `input`.
@@ -183,9 +183,9 @@ class VoltageDrift(Actuation):
 
         v -> v + rate t
 
-    It needs an additional constant offset for the initial value. It belongs to a recording, not to the
-    machine, so it cannot predict another run. Time starts at the first sample of the recording that a model
-    is given. A part of another recording (`split`, `slice`) and a window of a fit (`window_seconds`)
+    The time `t` is zero at the first sample of the recording that a model is given; add `voltage_offset` for
+    the value there. The drift belongs to a recording, not to the machine, so an estimate does not apply to
+    another run. A part of another recording (`split`, `slice`) and a window of a fit (`window_seconds`)
     therefore start at zero again: fit the drift to whole recordings, and add `rate * part.start` to the
     voltage of a later part. Windows of one simulation (`simulate_windows`) share the time of their recording.
 
@@ -227,16 +227,22 @@ class PeriodicDisturbance(Actuation):
 
         v -> v + sine sin(2 pi frequency t) + cosine cos(2 pi frequency t)
 
-    A periodic torque at the motor's port is equivalent to this voltage times torque constant over resistance.
-    A periodic torque at another port is not: no single amplitude then explains both angles. The disturbance
-    belongs to a recording, not to the machine, and its phase in another run is unknown, so it cannot predict
-    another run. Time starts at the first sample of the recording that a model is given, as for
-    `voltage_drift`. Not for a torque that depends on the angle, which also has spectral lines if a machine
-    turns at constant speed (`cogging`).
+    The time `t` is zero at the first sample of the recording that a model is given, as for `voltage_drift`.
+    The voltage of each sample is changed by the mean of the disturbance over the sample.
+
+    A sinusoidal torque at the motor's port is equivalent to this voltage times the torque of the motor per
+    volt at rest: `efficiency torque_constant gear_ratio / resistance` for a `motor` without inductance. A
+    sinusoidal torque at another port is not equivalent to a voltage: no amplitude and phase then explain both
+    angles.
+
+    Sine and cosine belong to a recording, not to the machine. The phase in another run is unknown, so their
+    estimates do not apply to it. A search of several recordings estimates one frequency for all of them. Not
+    for a torque that depends on the angle, which also has spectral lines if a machine turns at constant speed
+    (`cogging`).
 
     Args:
         at: Always `input`.
-        sine: Amplitude of the sine that begins with the recording [V].
+        sine: Amplitude of the sine, which is zero at the first sample [V].
         cosine: Amplitude of the cosine [V].
         frequency: Frequency of the disturbance [Hz].
 
@@ -294,9 +300,9 @@ class Delay(Actuation):
 
         v(t) = u(t - time)
 
-    Exact in the mean and in the first moment over each sample, also if the delay is not a multiple of the
-    sampling period. Before the recording the command has its first value. Slow inputs cannot
-    distinguish it from a first-order lag.
+    Mean and first moment of the voltage over each sample are exact, also if the delay is not a multiple of
+    the sampling period. Before the recording the command has its first value. A slow input cannot distinguish
+    the delay from a first-order lag (`lag`).
 
     Args:
         at: Always `input`.
@@ -352,9 +358,9 @@ class Lag(Actuation):
 
         time dv/dt = u - v
 
-    Exact in the mean and in the first moment over each sample. Before the recording the command has its
-    first value. Slow inputs cannot distinguish it from a pure delay: both shift the phase, only the lag
-    reduces the amplitude.
+    Mean and first moment of the voltage over each sample are exact. Before the recording the command has its
+    first value. A slow input cannot distinguish the lag from a pure delay (`delay`): both shift the phase
+    alike, and there the lag hardly reduces the amplitude.
 
     Args:
         at: Always `input`.

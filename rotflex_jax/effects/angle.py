@@ -13,13 +13,13 @@ from rotflex_jax.parameters import parameter
 @register
 @dataclasses.dataclass(frozen=True)
 class Gravity(Force):
-    """The weight of an unbalanced mass on a tilted axis.
+    """The weight of an unbalanced mass on an axis that is not vertical.
 
         tau = -(sine sin(position) + cosine cos(position))
 
-    The law has two amplitudes instead of one amplitude and a phase, because the angle is zero where the
-    recording began. Not for a port that travels only a few degrees: there the sine is equivalent to a spring
-    and the cosine to a constant torque.
+    The law has two amplitudes, because the angle at which the mass hangs lowest is unknown: the angle is zero
+    where the recording began. Not for a port that travels only a few degrees: there the sine is equivalent to
+    a spring and the cosine to a constant torque.
 
     Args:
         at: Port.
@@ -69,16 +69,15 @@ class Cogging(Force):
 
         tau = -(sine sin(periods position) + cosine cos(periods position))
 
-    The law has two amplitudes instead of one amplitude and a phase, because the angle is zero where the
-    recording began. Not for a port that travels less than about one period: there it is equivalent to a
-    spring or a constant torque. A torque that repeats once per turn is the weight of an unbalanced mass
-    (`gravity`).
+    The law has two amplitudes, because the phase is unknown: the angle is zero where the recording began. Not
+    for a port that travels less than about half a period: there the torque is equivalent to a spring or a
+    constant torque. A torque that repeats once per turn is the weight of an unbalanced mass (`gravity`).
 
     Args:
         at: Port.
         sine: Amplitude of the sine [N m].
         cosine: Amplitude of the cosine [N m].
-        periods: Repetitions per turn of the port.
+        periods: Repetitions per turn of the port [-].
 
     Source: D. Hanselman, Brushless Permanent Magnet Motor Design, 2nd ed., 2003, chapter 4.
     """

@@ -84,7 +84,7 @@ class Stamp(NamedTuple):
 
     `M += inertia p p'`, `D += damping p p'`, `K += stiffness p p'`, torque `drive voltage` at `p`.
     A linear effect with states `z` of its own adds `z' = own z + from_speed p.dq + from_voltage v`
-    (lists of length m, `own` m by m) and the torque `torque . z` at `p`.
+    (tuples of length m, `own` m by m) and the torque `torque . z` at `p`.
     """
 
     inertia: Scalar = 0.0
@@ -148,8 +148,9 @@ class Effect(abc.ABC):
             for an effect that a measured signal drives, as `"arm: acceleration of link 1 [rad/s^2]"`.
 
     Raises:
-        InputError: A class with a `name` is defined without a method or declaration that its kind requires;
-            or an instance is given a value outside of its bounds.
+        InputError: If a class with a `name` is defined without a method or declaration that its kind
+            requires; or if an instance is given an `at` that is no text, or a parameter that is no finite
+            number or is outside of its bounds.
     """
 
     # -- declared by each effect
@@ -198,7 +199,7 @@ class Effect(abc.ABC):
     # Reason why a linear model of a mechanism omits it, as part of a message; empty if its slope enters.
     not_linearised: ClassVar[str] = ""
 
-    # While JAX traces a mechanism, its numbers are arrays or placeholders, which a run-time checker of
+    # While JAX traces a mechanism, its parameters are arrays or placeholders, which a run-time checker of
     # annotations would not accept. `__post_init__` checks the values.
     __no_type_check__: ClassVar[bool] = True
 
@@ -326,7 +327,7 @@ class Effect(abc.ABC):
         """The checked result of `probes`, as values in the order of `declared`.
 
         Raises:
-            InputError: `probes` does not return a list of lists of mappings, or a mapping does not give a
+            InputError: If `probes` does not return a list of lists of mappings, or a mapping does not give a
                 finite number for exactly the declared parameters.
         """
         given, names = cls.probes(scale), tuple(cls.declared())
@@ -364,7 +365,7 @@ class Effect(abc.ABC):
         return ()
 
     def sentence(self) -> str:
-        """The effect with its values as text, for a person."""
+        """The effect with its values, in one sentence."""
         numbers = ", ".join(
             f"{n} {v:.4g} {specifications(self)[n].unit}".rstrip() for n, v in self.values.items()
         )
@@ -422,7 +423,11 @@ class Linear(Effect):
 
 
 class Force(Effect):
-    """A smooth (or at least continuous) torque at a port."""
+    """A smooth (or at least continuous) torque at a port.
+
+    Raises:
+        InputError: If a class is defined with a `driven_by` that a force cannot have.
+    """
 
     kind_label: ClassVar[str] = "force"
     kind_meaning: ClassVar[str] = "A torque that depends on position, speed or voltage at this moment."
@@ -441,7 +446,14 @@ class Force(Effect):
 
     @abc.abstractmethod
     def force(self, position: Scalar, speed: Scalar, voltage: Scalar) -> Scalar:
-        """Torque [N m] on the port; for an effect with a signal, `voltage` is the value of the signal."""
+        """Torque [N m] on the port.
+
+        Args:
+            position: Position of the port [rad].
+            speed: Speed of the port [rad/s].
+            voltage: Voltage of the motor [V]; the value of the signal for an effect with a signal, and the
+                torque of the motor [N m] for an effect that is `driven_by` it.
+        """
 
     @classmethod
     def needs(cls) -> tuple[str, ...]:
@@ -450,7 +462,7 @@ class Force(Effect):
 
 
 class DryFriction(Effect):
-    """Set-valued friction: a port at rest is held by any torque within the level, sliding meets the level."""
+    """Set-valued friction: the level opposes sliding, and any torque within it holds a port at rest."""
 
     kind_label: ClassVar[str] = "dry friction"
     kind_meaning: ClassVar[str] = (
@@ -651,7 +663,7 @@ def register(effect: EffectClass) -> EffectClass:
         The class, unchanged.
 
     Raises:
-        InputError: Another class already has the name.
+        InputError: If another class already has the name.
     """
     known = CATALOG.setdefault(effect.name, effect)
     # If a module is run again (a notebook cell, a reload), its class replaces the earlier one.

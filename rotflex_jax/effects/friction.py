@@ -60,9 +60,9 @@ class CoulombAsymmetric(DryFriction):
 
         tau = -forward while speed > 0, backward while speed < 0, between the two at rest
 
-    On most recordings it cannot be distinguished from symmetric friction with a constant torque (a
-    voltage offset at the hub, a shift of the deflection at the joint), to which it is equal
-    while it slides.
+    It is equal to symmetric friction of the level `(forward + backward) / 2` together with the constant
+    torque `(backward - forward) / 2`. On most recordings the two cannot be distinguished, since a voltage
+    offset at the hub, or a shift of the deflection at the joint, gives such a torque.
 
     Args:
         at: Port.
@@ -113,8 +113,9 @@ class Stribeck(DryFriction):
 
         |tau| = level + excess exp(-(v/speed)^2) while sliding, up to level + excess at rest
 
-    Not for a recording without slow motion: where the port reverses quickly, the excess cannot be
-    distinguished from a slightly larger constant level.
+    `v` is the speed of the port; at `v = speed` a share exp(-1) of the excess is left. Not for a recording
+    without slow motion: where the port reverses quickly, the excess cannot be distinguished from a slightly
+    larger constant level.
 
     Args:
         at: Port.
@@ -172,22 +173,26 @@ class LoadFriction(DryFriction):
 
         |tau| = level + driving |load| while the motor drives,  level + driven |load| while it is driven
 
-    At rest any torque up to that level holds the port. `load` is the torque through the gear, taken as the
-    mean of both sides of the port: the torque of the motor, and the torque that the rest of the machine
-    takes. With `of="motor"` it is the torque of the motor alone: a machine that turns the gear back while the
-    motor gives no torque then meets the constant level only. The motor drives if the load has the sign of the
-    speed. A load cannot turn a gear with `driven` of 2 or more. Not together with a free efficiency of the
-    motor, which has the same influence while the motor drives.
+    `load` is the torque through the gear, taken as the mean of both sides of the port: the torque of the
+    motor, and the torque that the rest of the machine takes. With `of="motor"` it is the torque of the motor
+    alone: a machine that turns the gear back while the motor gives no torque then meets the constant level
+    only. The motor drives if the load has the sign of the speed. At rest any torque up to the level holds
+    the port, with the share for the direction in which the port would start to move. With `of="both"`, no
+    load can turn a motor that gives no torque if `driven` is 2 or more. Not together with a free efficiency
+    of the motor, which has the same influence while the motor drives.
 
     Args:
         at: Port of the motor.
         level: Friction torque without load [N m].
-        driving: Share of the load while the motor drives.
-        driven: Share of the load while the load drives the motor.
+        driving: Share of the load that is lost while the motor drives [-].
+        driven: Share of the load that is lost while the load drives the motor [-].
         tied: Whether `driven` always equals `driving`, whatever value is given for it (model M3). Useful for
             recordings of a servo with one weight, which cannot distinguish two shares from another torque
             constant.
         of: Torque that is the load: the mean torque of "both" sides of the port, or of the "motor" alone.
+
+    Raises:
+        InputError: If `of` is none of these, `tied` is not True or False, or a value is out of its bounds.
 
     Source: M. Duclusaud, G. Passault, V. Padois and O. Ly, Extended friction models for the physics
     simulation of servo actuators, 2024, models M3 and M5 (load-dependent and directional friction).
@@ -270,18 +275,20 @@ class GearFriction(DryFriction):
 
         |tau| = level + share |motor torque|
 
-    At rest any torque up to that level holds the port. It is `LoadFriction` of the motor's torque with one
-    share for both directions of power flow; a recording with one load cannot determine more. If the motor's
-    torque is in phase with the speed, the effect can hardly be distinguished from viscous damping or another
-    torque per volt; a weight or a spring that the motor holds makes it distinguishable.
+    The motor torque is the torque that the motor gives at this port, with `heating` and `torque_saturation`
+    included. At rest any torque up to the level holds the port. Where the port reverses, the friction changes
+    its sign and keeps its magnitude. It is `LoadFriction` with `of="motor"` and `tied=True`: one share,
+    whether the motor drives the machine or is driven; a recording with one load cannot determine two. If the
+    motor's torque is in phase with the speed, the effect can hardly be distinguished from viscous damping or
+    another torque per volt; a weight or a spring that the motor holds makes it distinguishable.
 
     Args:
         at: Port of the motor.
         level: Friction torque without load [N m].
-        share: Share of the motor's torque that is lost.
+        share: Share of the motor's torque that is lost [-].
 
     Source: M. Duclusaud, G. Passault, V. Padois and O. Ly, Extended friction models for the physics
-        simulation of servo actuators, 2024, model M3, by the torque of the motor.
+        simulation of servo actuators, 2024, model M3, here with the torque of the motor as its load.
     """
 
     name: ClassVar[str] = "gear_friction"

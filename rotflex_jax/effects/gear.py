@@ -15,18 +15,23 @@ class Backlash(Gear):
 
         |r| <= gap,    tau >= 0 at r = gap,    tau <= 0 at r = -gap,    tau = 0 between
 
-    `r` is the angle of the rotor relative to the port, referred to the port, and `tau` the transmitted
-    torque. The rotor has a `share` of the inertia that is entered at the port; the motor with its back-EMF
-    acts on the rotor, all other effects at the port act on the rest. Effects on the motor shaft itself are
-    entered at the port `rotor`, which a mechanism with this gear has in addition to its own ports. The impact
-    of the teeth is inelastic. Not for a spring that is loose about its rest position, which is `joint_play`,
-    nor for play that is never crossed, which only shifts the angle. Together with `heating` and
-    `torque_saturation`, the lost torque acts on the port even while the teeth are out of contact.
+    `r` is the angle of the rotor relative to the port, referred to the port, and `tau` the torque that the
+    teeth transmit to the port. When `tau` changes its sign, the teeth separate, and the rotor crosses the
+    play of `2 gap` without driving the port. The impact at the other stop is inelastic: after it rotor and
+    port have the same speed.
+
+    The rotor has a `share` of the inertia that is entered at the port. The motor with its back-EMF acts on
+    the rotor, all other effects at the port act on the rest. Effects on the motor shaft itself are entered at
+    the port `rotor`, which a mechanism with this gear has in addition to its own ports. The torque that
+    `heating` and `torque_saturation` take from the motor is subtracted at the port, even while the teeth are
+    out of contact. Not for a spring that is loose about its rest position, which is `joint_play`, nor for
+    play that is never crossed, which only shifts the angle. A mechanism has at most one gear with play, at a
+    port with a motor and an inertia.
 
     Args:
         at: Port of the motor.
-        gap: Half of the play [rad], referred to the port.
-        share: Share of the rotor in the inertia of the port.
+        gap: Half of the play, referred to the port [rad].
+        share: Share of the rotor in the inertia of the port [-].
 
     Source: M. Nordin and P.-O. Gutman, Controlling mechanical systems with backlash, Automatica 38,
     2002; F. Pfeiffer and C. Glocker, Multibody Dynamics with Unilateral Contacts, 1996, chapter 6.
@@ -75,21 +80,22 @@ class Backlash(Gear):
 @register
 @dataclasses.dataclass(frozen=True)
 class ElasticBacklash(Gear):
-    """Play of a gear with elastic teeth: beyond the play they push like a damped spring, and never pull.
+    """Play of a gear with elastic teeth: teeth in contact push like a damped spring, and never pull.
 
         tau = max(0, stiffness depth + damping depth') sign(r),   depth = |r| - gap > 0,   0 within the play
 
-    `r` is the angle of the rotor relative to the port, referred to the port, and `tau` the torque on the
-    port. The rotor has a `share` of the inertia that is entered at the port. The motor with its back-EMF and
-    all effects at the port `rotor` act on the rotor, all other effects at the port act on the rest. Without a
-    gap it is a gear with elasticity only. Not for teeth that oscillate far above the sampling frequency: use
-    the limit of rigid teeth, `backlash`, without the two parameters that no recording then shows. A search
-    tries this effect on request and in place of `backlash`, since a machine has one gear.
+    `r` is the angle of the rotor relative to the port, referred to the port, and `tau` the torque that the
+    teeth transmit to the port. The rotor has a `share` of the inertia that is entered at the port. The motor
+    with its back-EMF and all effects at the port `rotor` act on the rotor, all other effects at the port act
+    on the rest. With a `gap` of zero it is an elastic gear without play. Not for teeth that oscillate far
+    above the sampling frequency: a recording then does not determine their stiffness and damping, and
+    `backlash` with its rigid teeth is enough. A search tries this effect only on request, and in place of
+    `backlash`, since a mechanism has at most one gear with play.
 
     Args:
         at: Port of the motor.
-        gap: Half of the play [rad], referred to the port.
-        share: Share of the rotor in the inertia of the port.
+        gap: Half of the play, referred to the port [rad].
+        share: Share of the rotor in the inertia of the port [-].
         stiffness: Stiffness of teeth in contact [N m/rad].
         damping: Damping of teeth in contact [N m s/rad].
 

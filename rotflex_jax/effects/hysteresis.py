@@ -17,13 +17,16 @@ class Dahl(Memory):
 
         dz/dt = speed/presliding - |speed|/presliding z,    tau = -level z
 
-    Not for a recording in which the presliding is below the resolution of the sensor: there it is equivalent
-    to Coulomb friction, which is simpler. It has no breakaway level and creeps under a vibrating load.
+    The state `z` approaches 1 while the port slides forwards and -1 while it slides backwards. At rest it
+    does not change, so the torque keeps its value. After a reversal the torque approaches the level in the
+    other direction: a displacement of `presliding` reduces the difference to a share exp(-1). There is no
+    breakaway level, and a port under a vibrating load creeps. Not for a recording in which the presliding is
+    below the resolution of the sensor: there the effect is equivalent to Coulomb friction, which is simpler.
 
     Args:
         at: Port.
-        level: Friction torque when it slides [N m].
-        presliding: Displacement over which it builds up [rad].
+        level: Friction torque while the port slides [N m].
+        presliding: Displacement over which the torque builds up [rad].
 
     Source: Dahl 1968, equation with exponent 1.
     """
@@ -69,25 +72,32 @@ class Dahl(Memory):
 @register
 @dataclasses.dataclass(frozen=True)
 class LuGre(Memory):
-    """The friction model of Lund and Grenoble, with a state that is 1 while the port slides fast.
+    """The friction model of Lund and Grenoble; its state is the normalised deflection of elastic bristles.
 
         g = 1 + rise exp(-(speed/slow)^2)
         dz/dt = (speed - |speed| z / g) / presliding
         tau = -(level z + damping exp(-(speed/slow)^2) presliding dz/dt)
 
+    The state `z` is the deflection of the bristles divided by `presliding`. It is 1 while the port slides
+    fast forwards and -1 backwards; while it slides slowly, its magnitude is up to `1 + rise`. At rest the
+    state does not change, so the torque keeps its value. After a reversal the torque builds up in the other
+    direction over a displacement of about `presliding`.
+
     In the usual symbols `level` is Fc, `level rise` is Fs - Fc, `level / presliding` is sigma0 and
     `damping` is sigma1; sigma2 is viscous damping, which is a separate effect. Not for a recording in which
-    the presliding is below the resolution of the sensor: there it is equivalent to Stribeck friction, which
-    is simpler. Both the rise and the damping of the bristles decrease with the speed: at `slow` a share
-    exp(-1) of each is left. With a constant damping, friction would generate energy at speeds where
-    `damping |speed|` exceeds `4 level g`, and a fit to a fast machine would use this damping to describe
-    impacts. With the damping used here, friction generates energy at no speed if `damping slow` is below
-    `9 level`; check a larger fitted value.
+    the presliding is below the resolution of the sensor: there the effect is equivalent to Stribeck friction,
+    which is simpler.
+
+    The rise and the damping of the bristles decrease with the speed: at `slow` a share exp(-1) of each is
+    left. With a constant damping, friction could generate energy at speeds where `damping |speed|` exceeds
+    `4 level g`, and a fit to a fast machine would use this damping to describe impacts. With the damping of
+    this law, friction generates energy at no speed if `damping slow` is below `9 level`; check a larger
+    fitted value.
 
     Args:
         at: Port.
-        level: Friction torque when it slides fast [N m].
-        rise: Breakaway level divided by `level`, minus one.
+        level: Friction torque while the port slides fast [N m].
+        rise: Breakaway level divided by `level`, minus one [-].
         slow: Speed over which the rise and the damping of the bristles are lost [rad/s].
         presliding: Displacement over which the torque builds up [rad].
         damping: Damping of the bristles at rest [N m s/rad].
@@ -162,22 +172,25 @@ class LuGre(Memory):
 @register
 @dataclasses.dataclass(frozen=True)
 class BoucWen(Memory):
-    """Hysteresis of Bouc and Wen, normalised so that the state stays within -1 and 1.
+    """Hysteresis of Bouc and Wen, normalised so that the state stays between -1 and 1.
 
         dz/dt = speed/width - (beta |speed| z + (1 - beta) speed |z|) / width,    tau = -level z
 
-    `beta` is the share that depends on the direction of motion: 1 is Dahl friction, 0 a spring that
-    saturates without loss. A recording without small reversals cannot distinguish it from Dahl friction:
-    the two differ only where the motion reverses before the state has saturated.
+    With `beta` of 1 this is Dahl friction, with `beta` of 0 a spring that saturates and loses no energy. At
+    rest the state does not change, so the torque keeps its value. While state and speed have the same sign,
+    `beta` has no influence: the state approaches 1 or -1, and a displacement of `width` reduces the
+    difference to a share exp(-1). After a reversal, until the state changes its sign, it changes more slowly
+    the smaller `beta` is. A recording that hardly shows this part of the motion cannot distinguish the effect
+    from Dahl friction.
 
-    With `beta` below one half, the state accelerates after a reversal until it changes its sign. A step that
-    linearises the law could move the state far beyond 1, so the state is limited to its range.
+    With `beta` below one half, the state changes faster and faster after a reversal until it changes its
+    sign. A step that linearises the law could move it far beyond 1, so the state is limited to its range.
 
     Args:
         at: Port.
         level: Torque at saturation [N m].
-        width: Deflection over which the torque builds up [rad].
-        beta: Share of the hysteretic part.
+        width: Displacement over which the torque builds up [rad].
+        beta: Share of the hysteretic part [-].
 
     Source: R. Bouc 1967; Y.-K. Wen, J. Eng. Mech. Div. 102, 1976, with exponent 1.
     """

@@ -52,17 +52,17 @@ class Inertia(Linear):
 class SecondMode(Linear):
     """An inertia on a spring at the port: one more mode, such as the first bending mode of an arm.
 
-        r'' + 2 damping W (r' - p.dq) + W^2 (r - p.q) = 0,    W = 2 pi frequency
+        r'' + 2 damping W (r' - speed) + W^2 (r - position) = 0,    W = 2 pi frequency
         tau = -inertia r''
 
-    Not for a frequency above the excited band: the part then moves with the port, and its inertia only
-    adds to the inertia at the port.
+    `r` is the angle of the part, position and speed are those of the port. Not for a frequency above the
+    excited band: the part then moves with the port, and its inertia only adds to the inertia at the port.
 
     Args:
         at: Port.
         inertia: Inertia of the part [kg m^2].
         frequency: Natural frequency of the part while the port is held [Hz].
-        damping: Damping ratio of the part.
+        damping: Damping ratio of the part [-].
 
     Source: J. P. Den Hartog, Mechanical Vibrations, 4th ed., 1956, section 3.2.
     """

@@ -40,7 +40,7 @@ def law_phrase(effect: str, port: str) -> str:
 
 
 def law_of(effect: str) -> str:
-    """The phenomenon that an effect and other laws describe, as dry friction; empty without other laws."""
+    """Phenomenon that an effect and other laws describe, such as dry friction; empty if no other law does."""
     known = CATALOG.get(effect)
     return known.law_of if known else ""
 
@@ -63,7 +63,8 @@ def effect_title(effect: str) -> str:
     return known.title if known else effect.replace("_", " ")
 
 
-# What may precede the name of an effect in a list. After any other word, "spring" or "delay" is a usual word.
+# What may precede the name of an effect in a list. After any other word, "spring" or "delay" is an
+# ordinary word.
 _BEFORE_A_NAME = re.compile(r"(?:^|[^\w\s]\s*|\b(?:and|or|from|refitting|scoring)\s)$")
 
 

@@ -24,8 +24,9 @@ class LearnedTorque(Force):
 
         tau = sum_ij w_ij b_i(position) b_j(asinh(speed / bend))
 
-    The speed is transformed so that the splines are dense where friction changes sign and wide
-    elsewhere. Outside of its ranges the map is constant. The splines of one axis add up to one.
+    The speed is transformed so that the splines are dense near zero speed, where friction changes its sign,
+    and wide elsewhere. Beyond an end of a range the map keeps its value at this end. The splines of one axis
+    add up to one.
 
     An effect with a formula has fewer parameters: use this one if no effect of the catalogue explains the
     recording, and interpret it (`rf.learn_torque`). Not for a torque that depends on time or on the past, and
@@ -35,10 +36,14 @@ class LearnedTorque(Force):
         at: Port.
         position: Range of positions [rad].
         speed: Range of speeds [rad/s].
-        bend: Speed below which the transformation is linear [rad/s].
-        count: Number of splines along position and speed; 1 for no dependence, otherwise 4 or more.
+        bend: Speed below which the transformation is nearly linear [rad/s].
+        count: Number of splines along position and along speed; 1 for no dependence, otherwise 4 or more.
         scale: Typical size of the weights [N m], by which a fit scales its steps.
         weights: Torques [N m], for each position all speeds; zero if none are given.
+
+    Raises:
+        InputError: If a range is empty or not finite, a number of splines is below 4 and not 1, `bend` or
+            `scale` is not positive, or there is not one weight for each spline.
 
     Source: C. de Boor, A Practical Guide to Splines, 1978, chapter 9; P. Eilers and B. Marx, Statist. Sci.
     11, 1996.

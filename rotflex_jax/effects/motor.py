@@ -38,19 +38,22 @@ class Motor(Linear):
     amplifier, whose torque does not depend on the back-EMF (`current_drive`).
 
     In SI units the torque constant and the back-EMF constant of a motor are equal. `tied` keeps them equal: a
-    fit of the torque constant then also changes the back-EMF constant. Not if the efficiency is a guess: the
-    fitted torque constant then also contains the true losses of the gear, and the back-EMF constant would
-    follow it away from its true value.
+    fit of the torque constant then also changes the back-EMF constant. Do not tie them if the efficiency is a
+    guess: the fitted torque constant then also contains the true losses of the gear, and the back-EMF
+    constant would follow it away from its true value.
 
     Args:
-        at: Port the gear drives.
-        torque_constant: Torque per current [N m/A].
+        at: Port that the gear drives.
+        torque_constant: Torque at the motor shaft per current [N m/A].
         back_emf: Voltage per speed of the motor shaft [V s/rad].
         resistance: Armature resistance [ohm].
-        gear_ratio: Turns of the motor per turn of the port.
-        efficiency: Efficiency of motor and gear together; 1 without losses.
+        gear_ratio: Turns of the motor per turn of the port [-].
+        efficiency: Efficiency of motor and gear together, 1 without losses [-].
         inductance: Armature inductance [H], or None.
         tied: Whether `back_emf` always equals the torque constant, whatever value is given for it.
+
+    Raises:
+        InputError: If `tied` is not True or False, or a value is out of its bounds.
 
     Source: Quanser, SRV02 user manual, 2011, table 3.1 and the section on modelling.
     """
@@ -137,7 +140,7 @@ class CurrentDrive(Linear):
     Not for a motor on a voltage amplifier, where the back-EMF brakes the motor: use `Motor`.
 
     Args:
-        at: Port it drives.
+        at: Port that the motor drives.
         gain: Torque per command [N m/V].
 
     Source: M. W. Spong, S. Hutchinson and M. Vidyasagar, Robot Modeling and Control, 2006, section 6.1.
@@ -165,13 +168,14 @@ class CurrentDrive(Linear):
 @register
 @dataclasses.dataclass(frozen=True)
 class Heating(Memory):
-    """The armature's resistance rises with its own heat: R becomes R (1 + rate z).
+    """The resistance of the armature rises with its temperature: `R` becomes `R (1 + rate z)`.
 
         dz/dt = m^2 / (1 + rate z) - z / time,    tau = -rate z / (1 + rate z) m
 
-    `m` is the torque of the cold motor at this port, so `tau` is the lost torque; the current heats the
-    armature. Not for a recording that is much shorter than `time` with a uniform input: the loss is then
-    equivalent to a lower torque constant.
+    `z` is the heat of the armature in (N m)^2 s, zero for the cold motor. `m` is the torque that the cold
+    motor would give at this port, so `tau` is the lost torque. Without current the motor cools with the time
+    constant `time`. A recording that is much shorter than `time` does not determine `time`. Not for a
+    recording in which `z` hardly varies: the loss is then equivalent to a lower torque constant.
 
     Args:
         at: Port of the motor.
@@ -224,17 +228,19 @@ class TorqueSaturation(Force):
 
         tau = -loss |m| / (1 + loss |m|) m
 
-    `m` is the torque at this port in proportion to the current of the motor. Small torques are nearly equal
-    to `m`, large ones stay below `1 / loss`, since the iron of a small motor saturates and the armature
-    weakens the field. Not for a motor that runs at one level of torque, where the loss is equivalent to a
-    lower torque constant.
+    `m` is the torque at this port that the motor would give without saturation, in proportion to its current,
+    and `tau` is the lost torque. It depends on the current and not on the speed, so a reversal of the motion
+    alone does not change it. Small torques are nearly equal to `m`; at `m = 1 / loss` half of `m` is lost,
+    and the remaining torque stays below `1 / loss`. The causes are that the iron of a small motor saturates
+    and that the field of the armature weakens the main field. Not for a motor that runs at one level of
+    torque, where the loss is equivalent to a lower torque constant.
 
     Args:
         at: Port of the motor.
-        loss: Relative loss of torque per torque of the linear motor [1/(N m)].
+        loss: Relative loss of torque per torque without saturation [1/(N m)].
 
     Source: A. E. Fitzgerald, C. Kingsley and S. D. Umans, Electric Machinery, 6th ed., 2003, section 7.3, on
-        the effect of the armature's field; the simplest law of one parameter with a limit.
+        the effect of the armature's field. The formula is the simplest with one parameter and a limit.
     """
 
     name: ClassVar[str] = "torque_saturation"
@@ -353,7 +359,7 @@ class PositionLoop(Linear):
         return Stamp(stiffness=stiffness, drive=stiffness, damping=braking)
 
     def _error(self, position: Scalar, speed: Scalar, goal: Scalar) -> Scalar:
-        """Goal less the angle, which the firmware knows on average half a control period late [rad]."""
+        """Goal less the angle that the firmware uses, on average half a control period old [rad]."""
         return goal - position + self.period / 2 * speed
 
     def _counted(self, error: Scalar) -> Scalar:
@@ -418,6 +424,7 @@ class PositionServo(PositionLoop, Force):
         duty = min(max(gain gain_scale band(goal - ...) - derivative speed, -limit), limit),
         band(e) = 0 for |e| <= dead_band,  e - dead_band sign(e) beyond
         supply - source_resistance duty i  in the place of the supply,  i the current of the armature
+        enabled tau  in the place of tau
 
     Angle, speed and torque are quantities of the output shaft, so the torque constant contains the gear ratio
     and also determines the back-EMF. The firmware computes the duty from the angle once in every period and
@@ -430,7 +437,7 @@ class PositionServo(PositionLoop, Force):
     While the duty is below its limit, the loop is linear and the step integrates it exactly. At the limit the
     step subtracts a torque, by the rule for smooth torques. There the step must be short compared with the
     loop: `Ts sqrt(stiffness / inertia)` below 0.15 gives errors of about one count of an encoder, with the
-    stiffness `torque_constant / resistance * supply * gain * gain_scale`. Above it use
+    stiffness `torque_constant / resistance * supply * gain * gain_scale`. Above 0.15 use
     `Exponential(order=4)` or `substeps`.
 
     Gain, limit and supply are known, and the gain may differ between recordings (`Recording.constants`).
@@ -438,10 +445,10 @@ class PositionServo(PositionLoop, Force):
     port only if the damping is known, since back-EMF and damping add up.
 
     Args:
-        at: Port the servo drives.
+        at: Port that the servo drives.
         gain: P gain of the firmware, in its own unit.
         gain_scale: Duty per angle for a gain of one [1/rad].
-        limit: Largest duty, 1 for the whole supply.
+        limit: Largest duty, 1 for the whole supply [-].
         supply: Supply voltage [V].
         period: Control period of the firmware [s].
         torque_constant: Torque per current, equal to voltage per speed [N m/A].
@@ -480,19 +487,20 @@ class PidServo(PositionLoop, Memory):
         duty = min(max(wanted, -limit), limit)
         dz/dt = integral band(e) - anti_windup (wanted - duty)
 
-    The motor is the motor of `PositionServo`. The state z is the duty of the I gain. While the duty is at its
-    limit, the duty beyond the limit is fed back to the integral (back-calculation), as in the firmware of a
-    Dynamixel X. Its manual shows an anti-windup gain without a value: release `anti_windup` if a log reaches
-    the limit. A large value keeps the integral from growing at the limit.
+    The motor, `band` and the other optional parts are those of `PositionServo`. The state `z` is the duty of
+    the I gain. While the duty is at its limit, the duty beyond the limit is fed back to the integral
+    (back-calculation), as in the firmware of a Dynamixel X. Its manual shows an anti-windup gain without a
+    value: release `anti_windup` if a log reaches the limit. A large value keeps the integral from growing at
+    the limit.
 
     The step treats the I part as a torque that is linear in time over the step; the rest of the loop is exact
     below the limit. Not for a servo without an I gain: `PositionServo` has one state less.
 
     Args:
-        at: Port the servo drives.
+        at: Port that the servo drives.
         gain: P gain of the firmware, in its own unit.
         gain_scale: Duty per angle for a gain of one [1/rad].
-        limit: Largest duty, 1 for the whole supply.
+        limit: Largest duty, 1 for the whole supply [-].
         supply: Supply voltage [V].
         period: Control period of the firmware [s].
         torque_constant: Torque per current, equal to voltage per speed [N m/A].

@@ -30,7 +30,7 @@ class SensorGain(Sensing):
 
     Args:
         at: Channel.
-        error: Relative error of the gain.
+        error: Relative error of the gain [-].
 
     Source: Any sensor's data sheet, sensitivity tolerance.
     """
@@ -124,7 +124,7 @@ class SensorCubic(Sensing):
 
     Args:
         at: Channel.
-        cubic: Relative error per square of the value [1/unit^2].
+        cubic: Relative error per square of the value [1/(unit of the channel)^2].
 
     Source: Any sensor's data sheet, linearity; first odd term of a Taylor series.
     """
@@ -175,7 +175,7 @@ class Rectifier(Sensing):
 
     Args:
         at: Channel.
-        loss: Share of the negative values that is lost.
+        loss: Share of the negative values that is lost [-].
 
     Source: P. Horowitz and W. Hill, The Art of Electronics, 3rd ed., 2015, section 1.6.
     """
@@ -212,10 +212,10 @@ class EccentricEncoder(Sensing):
 
         y = value + cosine cos(value) + sine sin(value)
 
-    The law has two amplitudes instead of one amplitude and a phase, because the angle is zero where the
-    recording began. An eccentricity `e` of a disc of radius `r` gives an amplitude of `e / r`. Not for an
-    encoder shaft that turns much less than once: there the effect is equivalent to a bias, a gain error and a
-    curvature (`sensor_cubic`).
+    The law has two amplitudes, because the phase is unknown: the angle is zero where the recording began. An
+    eccentricity `e` of a disc of radius `r` gives an amplitude of `e / r`. Not for an encoder shaft that
+    turns much less than once: there the effect is equivalent to a bias, a gain error and a curvature
+    (`sensor_cubic`).
 
     Args:
         at: Channel of an angle, equal to the angle of the encoder shaft.
@@ -284,8 +284,8 @@ class CrossTalk(Sensing):
 
         y = value + share other
 
-    `other` is the true value of the other sensor, or of the first of several others. Not for a servo angle
-    with a share of the deflection in it: this is the angle at another place of the shaft.
+    `other` is the true value of the other channel, or of the first of several others. Not for the sensor of
+    the servo angle: a share of the deflection there is the angle at another place of the shaft.
 
     Args:
         at: Channel that the other one disturbs.

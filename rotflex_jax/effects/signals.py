@@ -17,20 +17,22 @@ class MeasuredDisturbance(Force):
 
     The usual example is a machine on a moving base: with the acceleration of the base as the signal, the gain
     at each port is minus the inertia that the base carries along. Another example is the current of a second
-    motor. The signal is held over each sample, as the input is.
+    motor. The signal is constant over each sample. The torque does not depend on the motion of the machine,
+    so it acts in the same way at rest and in motion.
 
-    Not for a function of the machine's own outputs: the outputs would then explain themselves. The measured
-    motion of a neighbouring body is allowed, even if this machine also moves that body.
+    Not for a signal that is computed from the machine's own outputs: the model would then explain an output
+    by the same output. The measured motion of a neighbouring body is allowed, even if this machine also moves
+    that body.
 
     Args:
-        at: Port and name of the signal, `"arm: acceleration of link 1 [rad/s^2]"`; recordings have it among
-            their `signals`.
+        at: Port and name of the signal, such as `"arm: acceleration of link 1 [rad/s^2]"`. Each recording
+            must have the signal among its `signals`.
         gain: Torque per unit of the signal [N m per unit of the signal].
 
     Raises:
-        InputError: `at` does not name a port and a signal.
+        InputError: If `at` does not name a port and a signal, or the gain is not finite.
 
-    Source: Ljung, System Identification, 1999, section 1.2 (measured disturbances).
+    Source: L. Ljung, System Identification, 2nd ed., 1999, section 1.2 (measured disturbances).
 
     >>> MeasuredDisturbance(at="arm: acceleration of the base [m/s^2]", gain=-0.02).signal
     'acceleration of the base [m/s^2]'
