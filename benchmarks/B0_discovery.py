@@ -1,10 +1,17 @@
-"""B0: does the search find one hidden effect, and nothing where nothing is hidden?
+"""B0: how often the search finds one hidden effect, and nothing where nothing is hidden.
 
-Every effect of the arena at every port where it makes sense, two inputs and two seeds each; a few
-effects that the package has no name for, of which it should say that something is unexplained; and
-20 records with nothing hidden. The arena simulates them with a plant whose constants are up to
-20 % off the baseline's; the search sees voltage and encoder readings. Nothing was tuned on the
-report seeds.
+An independent simulator (`rotflex_jax.arena.simulator`) makes recordings of the flexible joint with a known
+hidden effect. Its constants differ by up to 20 % from those of the model with which the search starts; the
+search is given the voltage and the encoder readings. By default the recordings hide
+
+- every effect of the catalogue at every port where it makes sense, with two inputs and two seeds each;
+- effects that the catalogue lacks, for which the right verdict is `unexplained`;
+- nothing, in 20 recordings.
+
+Each answer is compared with the hidden effects, and the errors of the final model with those of the true
+structure fitted to the same data (the oracle). Settings of the search are tuned with the tuning seeds,
+results are reported with the report seeds. Recordings with the first two report seeds were read during
+revisions of the search (`claims.SEEN`), so that quoted figures leave them out.
 
     python benchmarks/B0_discovery.py --workers 2
     python benchmarks/B0_discovery.py --tuning --seeds 100 --inputs noise
@@ -18,12 +25,15 @@ report seeds.
     python benchmarks/B0_discovery.py --wrong-worlds 96 --workers 16
     python benchmarks/B0_discovery.py --wrong-worlds 24 --tuning
 
-Wrong worlds (`rotflex_jax.arena.wrong_worlds`) are what laboratories record, of machines whose model is
-wrong in more than one way. They have seeds, results and a page of their own (`results/B0_wrong_worlds.json`).
+Wrong worlds (`rotflex_jax.arena.wrong_worlds`) are recordings as in a laboratory, of machines whose model
+has more than one error. They have separate seeds and a separate results file and page
+(`results/B0_wrong_worlds.json`).
 
-Records that the file has already are skipped unless `--fresh` is given; every run adds to the file, and
-the tables and figures beside it are of all its records. With `--again` those of other code than the present
-one are run again, each in its place; the others stay, so that it may be stopped and gone on with.
+Results are written to `results/B0.json` (`B0_tuning.json` with `--tuning`) after each recording. Recordings
+that the file already contains are skipped; `--fresh` starts a new file. The tables and figures beside the
+file cover all of its recordings. `--again` repeats the recordings of the file that were searched with
+another version of the code, and replaces them one by one, so that it can be interrupted and continued.
+`--oracles` only repeats the fits of the true structures.
 """
 
 from __future__ import annotations
@@ -60,13 +70,13 @@ from rotflex_jax.arena.simulator.records import INPUTS
 TUNING, REPORT = tuple(range(100, 120)), tuple(range(1000, 1020))
 Job = dict[str, Any]
 JOB = ("world", "effects", "kind", "seed", "size", "seconds", "channels", "keep_evidence")
-"""What a row has of the job that it is of."""
+"""Keys of a row that repeat its job, from which `--again` rebuilds the job."""
 
 from rotflex_jax.text.files import write_file
 
 
 def jobs(a: argparse.Namespace, seeds: list[int], inputs: list[str]) -> list[Job]:
-    """Records of a run; the ones with nothing hidden take a seed each and the inputs in turn."""
+    """Jobs of a run; those with nothing hidden have one seed each and take the kinds of input in turn."""
     groups = [(place,) for place in (*DEFAULTS, *OUTSIDE)]
     if a.pairs or a.triples:
         groups = [*drawn(a.pairs, 2), *drawn(a.triples, 3)]
@@ -91,18 +101,18 @@ def jobs(a: argparse.Namespace, seeds: list[int], inputs: list[str]) -> list[Job
 
 
 def key(job: Job) -> str:
-    """Name of a record in the results."""
+    """Key of a recording in the results."""
     if "world" in job:
         return f"wrong world|{job['world']}"
     return f"{label(job)}|{job['kind']}|{job['seed']}|{job['seconds']:g}s"
 
 
 def prepare(started: Any = None) -> None:
-    """Settings of a process, ahead of JAX.
+    """Settings of a process that must be made before JAX starts.
 
     Args:
-        started: counter of the processes that share this machine; each keeps to one core then, and JAX starts
-            as many threads as it has cores. None for a process that is alone.
+        started: counter of the processes that share this machine; each process is then bound to one core, so
+            that JAX starts one thread. None for a single process.
     """
     from rotflex_jax.runtime.xla import bind_to_cores, cores, enable_fast_loops
 
@@ -116,7 +126,7 @@ def prepare(started: Any = None) -> None:
 
 
 def one(job: Job) -> dict[str, Any]:
-    """A job in a process of its own; imports late, after the settings."""
+    """Row of a job, computed in a worker; imports follow the settings of the process."""
     if "world" in job:
         from arena.wrong_trial import trial
     else:
@@ -126,7 +136,7 @@ def one(job: Job) -> dict[str, Any]:
 
 
 def again(row: Job) -> dict[str, Any]:
-    """The oracle of a record that is done, likewise."""
+    """A finished row with its oracle fitted again, computed in a worker."""
     from arena.trial import evaluated_again
 
     return evaluated_again(row)
@@ -138,13 +148,13 @@ def rows(
     task: Callable[[Job], dict[str, Any]] = one,
     minutes: float = math.inf,
 ) -> Iterator[tuple[Job, dict[str, Any]]]:
-    """Rows as they are ready; what was running when a process died is begun again.
+    """Yields each job with its row as soon as it is finished; if a process dies, the rest is started again.
 
     Args:
-        todo: What is to be run.
-        workers: Processes.
-        task: What makes a row of a job.
-        minutes: After so long nothing is begun any more; what runs is waited for.
+        todo: Jobs to run.
+        workers: Number of processes; with 1, the jobs run in this process.
+        task: Function that computes the row of a job.
+        minutes: Time after which no further job is started; running jobs are completed.
     """
     until = time.monotonic() + 60 * minutes
     if workers == 1:
@@ -170,10 +180,10 @@ def rows(
                 except BrokenProcessPool:
                     broken.append(job)
                     continue
-                except Exception as problem:  # a failure is a row too
+                except Exception as problem:  # a failure is recorded as a row
                     row = {**job, "error": f"{type(problem).__name__}: {problem}", "lines": []}
                 yield job, row
-        if len(broken) == len(left):  # none got through
+        if len(broken) == len(left):  # no job was completed
             for job in broken:
                 yield job, {**job, "error": "its process died", "lines": []}
             return
@@ -181,7 +191,7 @@ def rows(
 
 
 def save(path: Path, results: dict[str, Any]) -> None:
-    """Write at once or not at all."""
+    """Writes the results completely or not at all."""
     path.parent.mkdir(parents=True, exist_ok=True)
     write_file(path, json.dumps(results, indent=1) + "\n")
 
@@ -213,7 +223,7 @@ def arguments() -> argparse.Namespace:
 
 
 def main() -> int:
-    """Run what is missing, save after each record, print the table."""
+    """Runs missing recordings, saves after each one, and prints the table."""
     a = arguments()
     of = {True: (WORLDS_TUNING, WORLDS_REPORT), False: (TUNING, REPORT)}[bool(a.wrong_worlds)]
     known_seeds, first = of[0] if a.tuning else of[1], a.wrong_worlds or 2
@@ -234,7 +244,7 @@ def main() -> int:
     suffix += ("_tuning" if a.tuning else "") + ("_quick" if a.quick else "")
     path = a.out or HERE / "results" / f"B0{suffix}.json"
     wanted = [{"world": s} for s in seeds] if a.wrong_worlds else jobs(a, seeds, inputs)
-    if a.tuning:  # what probabilities are calibrated from
+    if a.tuning:  # the calibration of probabilities uses the evidence
         wanted = [{**job, "keep_evidence": True} for job in wanted]
     title = "B0, wrong worlds" if a.wrong_worlds else "B0"
     results: dict[str, Any] = {"benchmark": title, "runs": [], "records": {}}

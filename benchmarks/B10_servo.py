@@ -1,19 +1,27 @@
-"""B10: a hobby servo under its own firmware, beside the extended friction models of arXiv 2410.08650.
+"""B10: models of a hobby servo with its firmware, beside the extended friction models of arXiv 2410.08650.
 
     python benchmarks/B10_servo.py
     python benchmarks/B10_servo.py --only "gain 200" --parts models fits
     python benchmarks/B10_servo.py --parts "so101 search" --joints Elbow
     python benchmarks/B10_servo.py --fresh --rollouts 100000
 
-An XL-330 lifts a pendulum at four gains in three motions. Every motion and every gain is left out once: M1
-to M6 are fitted to the rest by evolution, as their authors do (`servo/friction_models.py` has the laws), the
-grey box by `rf.fit` with the frictions of the catalogue and, with `--parts search`, with what `rf.discover`
-finds, one of them by evolution over the same numbers. Compared are free runs of what was left out, and of
-joints of an SO-101.
+The recordings are of an XL-330 that lifts a pendulum, with four gains of its controller and three motions.
+Every motion and every gain is left out once, models are fitted to the other recordings, and the errors of
+free runs over those that were left out are compared. `--parts` chooses among
 
-Needs numba, and `rotflex data fetch bam_xl330 so101` or a folder named by `ROTFLEX_DATA`. What
-`results/B10.json` has already is kept unless `--fresh` is given; writes it, `results/B10.md` and, where the
-results are the kept ones, `docs/figures/servo.png`.
+    models        M1 to M6 (equations in servo/friction_models.py), fitted by CMA-ES as their authors do, and
+                  one structure of the grey box, fitted by CMA-ES too
+    fits          the grey box with several laws of friction, fitted by `rf.fit`
+    search        the grey box with the effects that `rf.discover` finds
+    direction     whether friction while lifting can be distinguished from friction while lowering
+    supply        resistance of the supply, from the motion and from its logged voltage
+    released      friction of the gear, from runs with the motor switched off
+    so101         the same comparison for joints of an SO-101
+    so101 search  a search for its joints that `--joints` names
+
+Needs numba, and the recordings: `rotflex data fetch bam_xl330 so101`, or a folder named by `ROTFLEX_DATA`.
+Writes `results/B10.json` and the page `results/B10.md`, and the figure docs/figures/servo.png unless `--out`
+names another folder. Results that the file already contains are kept unless `--fresh` is given.
 """
 
 from __future__ import annotations
@@ -33,7 +41,7 @@ HERE = Path(__file__).resolve().parent
 if str(HERE) not in sys.path:
     sys.path.insert(0, str(HERE))
 
-# Matrices of ten rows: threads would only wait for each other.
+# With matrices of ten rows, several threads would mostly wait for each other.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import jax
@@ -75,7 +83,7 @@ from rotflex_jax.text.files import write_file
 
 
 def machine() -> dict[str, Any]:
-    """Where the numbers come from."""
+    """Commit, machine and versions of the latest run."""
     return {
         "commit": git("rev-parse", "--short", "HEAD"),
         "processor": platform.processor() or platform.machine(),
@@ -88,7 +96,7 @@ def machine() -> dict[str, Any]:
 
 
 def rows(split: Split, parts: list[str], rollouts: int, say: Callable[[str], None]) -> dict[str, Callable]:
-    """Name of each row of a split -> what computes it."""
+    """Name of each row of a split -> function that computes it."""
     jobs: dict[str, Callable[[], dict[str, Any]]] = {}
     if "models" in parts:
         jobs |= {name: lambda name=name: evolved(name, split, rollouts, seed=1) for name in MODELS}

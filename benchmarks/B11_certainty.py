@@ -1,14 +1,19 @@
-"""Do the intervals hold the truth, and the bands the measurement?
+"""B11: how often intervals contain the true value, and how many samples lie inside prediction bands.
 
     python benchmarks/B11_certainty.py --workers 16
     python benchmarks/B11_certainty.py --tuning --parts intervals --only lugre --seeds 100,101
 
-Intervals: short records with one hidden friction or play at three sizes, fitted with the true structure; how
-often the 95 % interval of a profile holds the true number, beside Wald's. Bands: a run that nobody fitted, of
-the same machine; how many of its samples lie in the 90 % band of the true structure, and of the textbook's
-model that lacks the effect. Cost: processor seconds of profiles, identifiability, bands and probabilities on
-a record of 20 s. Nothing is recomputed that is in the results already; processes share compiled programs
-where ROTFLEX_PROGRAMS names a folder.
+All recordings are simulated (`rotflex_jax.arena.simulator`), so that the true values are known.
+
+- `intervals`: short recordings with one hidden friction or play, at three sizes. The true structure is
+  fitted; the result is the share of 95 % intervals by profile likelihood that contain the true value, and
+  the same for Wald intervals.
+- `bands`: a recording of the same machine that was not fitted. The result is the share of its samples in the
+  90 % band of the true structure, and of the textbook model, which lacks the effect.
+- `cost`: processor time of profiles, identifiability, bands and probabilities, for a recording of 20 s.
+
+Writes `results/B11.json` and the page `results/B11.md`. Rows that the results already contain are kept
+unless `--fresh` is given. Processes share compiled programs if ROTFLEX_PROGRAMS names a folder.
 """
 
 from __future__ import annotations
@@ -46,7 +51,7 @@ Job = dict[str, Any]
 
 
 def jobs(a: argparse.Namespace, seeds: list[int], inputs: list[str]) -> list[Job]:
-    """Records of a run."""
+    """Jobs of a run."""
     found = list[Job]()
     if "intervals" in a.parts:
         found += [
@@ -72,21 +77,21 @@ def jobs(a: argparse.Namespace, seeds: list[int], inputs: list[str]) -> list[Job
 
 
 def key(job: Job) -> str:
-    """Name of a row in the results."""
+    """Key of a row in the results."""
     name = "+".join("@".join(p) for p in job["effects"]) or "nothing"
     size = "" if job["size"] == 1 else f" x{job['size']:g}"
     return f"{job['part']}|{name}{size}|{job['kind']}|{job['seed']}|{job['seconds']:g}s"
 
 
 def one(job: Job) -> dict[str, Any]:
-    """A job in a process of its own; imports late, after the settings."""
+    """Row of a job, computed in a worker; imports follow the settings of the process."""
     from arena.certainty import trial
 
     return trial(job)
 
 
 def summary(rows: list[Job]) -> dict[str, Any]:
-    """Coverage of intervals by effect and size, and of bands by effect."""
+    """Coverage of intervals by effect and size, coverage of bands by effect, and cost by effect."""
     good = [r for r in rows if "error" not in r]
     intervals, bands = dict[str, Any](), dict[str, Any]()
     name = lambda r: "@".join(r["effects"][0])  # noqa: E731
@@ -119,7 +124,7 @@ def summary(rows: list[Job]) -> dict[str, Any]:
 
 
 def _intervals(found: list[Job]) -> dict[str, Any]:
-    """Sums over some intervals; widths and speeds as medians."""
+    """Number of some intervals, shares of them, and the median time of one [s]."""
     seconds = sorted(i["s"] for i in found)
     return {
         "count": len(found),
@@ -132,7 +137,7 @@ def _intervals(found: list[Job]) -> dict[str, Any]:
 
 
 def page(s: dict[str, Any], made: dict[str, Any]) -> str:
-    """Markdown of both tables."""
+    """Markdown of all tables."""
     percent = lambda x: f"{100 * x:.1f}"  # noqa: E731
     lines = ["# B11: intervals and bands", ""]
     lines += ["| effect, size | intervals | profile [%] | Wald [%] | Wald poor [%] | open [%] | s each |"]
@@ -165,7 +170,7 @@ def page(s: dict[str, Any], made: dict[str, Any]) -> str:
 
 
 def main() -> int:
-    """Run what is missing, save after each row, print the tables."""
+    """Runs missing rows, saves every few seconds, and prints the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--tuning", action="store_true", help="tuning seeds (report seeds if not)")
     parser.add_argument("--seeds", default="", help="as 1000,1001; all if omitted")

@@ -1,18 +1,19 @@
-"""B13: many runs, steps of fits and adaptive filters at once, on the processor and on an accelerator.
+"""B13: time of many runs, fit steps and adaptive filters at once, on the processor and on an accelerator.
 
     python benchmarks/B13_accelerator.py
 
-One compiled program works on K sets of parameters, in double precision, over 1000 samples: on an accelerator
-all at the same time, on a processor `TOGETHER` at a time.
+One compiled program evaluates K sets of parameters over 1000 samples in double precision: on an accelerator
+all sets at the same time, on a processor `TOGETHER` sets at a time.
 
-- `runs`: the joint of the paper with dry friction at the hub, 2 s at 500 Hz;
-- `fit_steps`: what a fit of all its parameters asks of such a run: its slopes, error and normal equations;
-- `filters`: LMS filters of a Volterra series of second order and 5 delays (21 weights), one for each pair of
-  step sizes; on a processor as the package sweeps them.
+- `runs`: free runs of the joint of the paper with dry friction at the hub, 2 s at 500 Hz;
+- `fit_steps`: the normal equations of a fit of all its parameters to such a run, with sensitivities and
+  error;
+- `filters`: LMS filters of a Volterra series of second order with 5 delays (21 weights), one for each pair
+  of step sizes; on a processor by the function of the package for sweeps.
 
-The time is that of one call, results left on the device, the least of several; on a processor one program
-uses one core. What would take longer than `LONGEST` is left out, and so is an accelerator that JAX lacks.
-Writes `results/B13.json`.
+The time is that of one call with data and results on the device, the least of `ROUNDS` calls. On a
+processor, one program uses one core. Numbers of sets whose call would take longer than `LONGEST` are left
+out, and so is an accelerator if JAX finds none. Writes `results/B13.json`.
 """
 
 from __future__ import annotations
@@ -48,17 +49,17 @@ from rotflex_jax.text.files import write_file
 SAMPLES, TS = 1000, 0.002
 COUNTS = (1, 16, 256, 4096, 65536)
 ROUNDS = 5
-# Sets of parameters side by side on a processor.
+# Number of sets of parameters that a processor evaluates side by side.
 TOGETHER = 16
-# Longest that a call may take [s].
+# Longest time that a call may take, extrapolated from the number of sets before [s].
 LONGEST = 20.0
 
 Work = tuple[Callable[[jax.Array], Any], Callable[[int], np.ndarray]]
-"""What is done with sets of parameters, and sets of that many."""
+"""Function of many sets of parameters, and a function that draws a given number of sets."""
 
 
 def side_by_side(one: Callable[[jax.Array], Any], device: jax.Device) -> Callable[[jax.Array], Any]:
-    """What is done with one set of parameters, done with many."""
+    """The function `one` of a set of parameters, applied to many sets on a device."""
     together = TOGETHER if device.platform == "cpu" else max(COUNTS)
     return lambda values: jax.lax.map(one, values, batch_size=min(together, len(values)))
 
@@ -69,7 +70,7 @@ def voltage() -> np.ndarray:
 
 
 def spread_about(values: np.ndarray, count: int) -> np.ndarray:
-    """Sets of parameters up to a fifth away from some values."""
+    """Sets of parameters that differ from given values by up to a fifth."""
     return values * np.random.default_rng(1).uniform(0.8, 1.2, (count, len(values)))
 
 
@@ -96,7 +97,7 @@ def fit_steps(device: jax.Device) -> Work:
     free, scale = jnp.arange(len(m.values)), jnp.full(samples.y.shape[1], 1e-3)
 
     def step(p: jax.Array) -> Any:
-        ways = directions(m.structure, p, free, 0)  # as if by the logarithm of each parameter
+        ways = directions(m.structure, p, free, 0)  # derivatives by the logarithm of each parameter
         return normal_equations(m.structure, solver, RunParameters(p, gates, x0, None), ways, samples, scale)
 
     return side_by_side(step, device), sets
@@ -121,7 +122,7 @@ def filters(device: jax.Device) -> Work:
 
 
 def times(device: jax.Device, work: Callable[[jax.Device], Work]) -> list[dict[str, float]]:
-    """Seconds of a call for each number of sets of parameters."""
+    """Time of a call for each number of sets of parameters [s]."""
     many, sets = work(device)
     run = jax.jit(many)
     rows = list[dict[str, float]]()
@@ -146,7 +147,7 @@ def times(device: jax.Device, work: Callable[[jax.Device], Work]) -> list[dict[s
 
 
 def main() -> int:
-    """Measure every device that JAX has, and save."""
+    """Measures every device that JAX finds, and saves the results."""
     rf.enable_fast_loops()
     devices = {"cpu": jax.devices("cpu")[0]}
     if jax.default_backend() != "cpu":

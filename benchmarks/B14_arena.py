@@ -1,10 +1,12 @@
-"""B14: the methods that come with the arena, each called like a user's method, on one small set of records.
+"""B14: scores of the methods that come with the arena, on one small set of recordings with known effects.
 
     python benchmarks/B14_arena.py --seed 20261
     python benchmarks/B14_arena.py --entrants refit_bic --fresh
 
-Each entrant runs in a process of its own, and every answer is written as soon as it is there; the same
-command goes on with those that are missing, unless `--fresh` is given.
+The search of this package and the methods it is compared with are called through the interface for methods
+of users, each in a separate process. The recordings are drawn from the seed; the scores are those of
+`rotflex_jax.arena.scores`. Writes `results/B14.json` and `results/B14.md` after every answer. The same
+command continues with missing answers; `--fresh` repeats those of the named methods.
 """
 
 from __future__ import annotations
@@ -29,7 +31,7 @@ SEED, RECORDS, SECONDS, LIMIT = 20261, 8, 8.0, 1500.0
 
 
 def keep(results: dict[str, Any], name: str, rows: list[dict[str, Any]]) -> None:
-    """The rows of a method, with what they say together."""
+    """Stores the rows of a method and their summary in the results."""
     marks = tuple(Marks.of({k: v for k, v in r.items() if k != "code"}) for r in rows)
     own = MethodScore(name, marks)
     results["methods"][name] = {"summary": own.summary(), "cells": cells(own), "rows": rows}
@@ -37,7 +39,7 @@ def keep(results: dict[str, Any], name: str, rows: list[dict[str, Any]]) -> None
 
 
 def page(results: dict[str, Any]) -> str:
-    """The tables in Markdown."""
+    """Markdown of the tables."""
     own, names = results["settings"], list(results["methods"])
     head = ["method", *COLUMNS.values()]
     lines = ["| " + " | ".join(head) + " |", "|---|" + "---:|" * len(COLUMNS)]
@@ -77,7 +79,7 @@ def page(results: dict[str, Any]) -> str:
 
 
 def main() -> int:
-    """Score what is missing, save after each entrant."""
+    """Scores missing answers and saves after each one."""
     parser = argparse.ArgumentParser(description="Score the methods that come with the arena.")
     parser.add_argument("--entrants", default=",".join(ENTRANTS), help="names, with commas between")
     parser.add_argument("--records", type=int, default=RECORDS, help="simulated records")
@@ -93,7 +95,7 @@ def main() -> int:
         results = json.loads(a.out.read_text())
         if results["settings"] != settings and not a.fresh:
             raise SystemExit(f"{a.out} has {results['settings']}, not {settings}; give --fresh or the same.")
-        # Answers to other records go with the settings; else only those of the named entrants do.
+        # With other settings all answers are dropped; otherwise only those of the named methods.
         dropped = a.entrants.split(",") if results["settings"] == settings else list(results["methods"])
         if a.fresh:
             kept = {n: m for n, m in results["methods"].items() if n not in dropped}

@@ -4,16 +4,17 @@
     python benchmarks/B15_fits.py --only rigid_arm emps
     python benchmarks/B15_fits.py --only whole
 
-Each machine of B9 that has a hub or an axis gets one law of friction there, and an offset of the input for
-each recording. It is fitted to free runs over 2 s from measured first states, as a user would (`rf.fit`):
-with `restarts=0`, and with as many as by default. Three of the laws contain Coulomb's as a limit, so that
-their least cost is no higher than its: a fit of them that ends above a fit of Coulomb's law has ended at a
-local minimum. The cost is over all that B9 fits its final models to; test recordings have no other use.
+Each machine of B9 that has a hub or an axis is fitted with one law of friction there and a voltage offset
+for each recording, to free runs over 2 s from measured first states (`rf.fit`): once with `restarts=0` and
+once with the default number of restarts. Three of the laws contain Coulomb friction as a limit, so that
+their global minimum is not above that of Coulomb friction. If a fit with one of them has a larger cost than
+the fit with Coulomb friction, it has ended in a local minimum. The cost is that of all training and
+validation data of B9 together; test data are used for the reported test errors only.
 
-`whole` are fits to whole runs of the rotary joint, of A and of both, with seven sets of effects.
+`whole` are fits to whole runs of the rotary joint, to run A and to both runs, with seven sets of effects.
 
 Needs the recordings, fetched or in the folder named by `ROTFLEX_DATA`. Writes `results/B15.json` after each
-direction; what is not run again is kept.
+direction (training to test data); results of other directions in the file are kept.
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ def fits(base: rf.Model, way: Way, law: str) -> list[dict[str, Any]]:
         m = m + CATALOG["voltage_offset"](at="input")
     model, runs = rf.Model(m, base.solver), list(joined((*way.train, *way.validation)))
     how: dict[str, Any] = {"local": [OFFSET], "first": "measured", "window_seconds": SECONDS}
-    rf.fit(model, runs, **how, restarts=1, max_steps=1)  # compiles what both need
+    rf.fit(model, runs, **how, restarts=1, max_steps=1)  # compiles the programs of both fits
     rows = []
     for options in ({"restarts": 0}, {}):
         begun = time.perf_counter()
@@ -72,7 +73,7 @@ def fits(base: rf.Model, way: Way, law: str) -> list[dict[str, Any]]:
     return rows
 
 
-# Effects at their ports that are fitted to whole runs.
+# Sets of effects and ports that are fitted to whole runs.
 SETS = (
     (("coulomb", "hub"),),
     (("stribeck", "hub"),),
@@ -109,7 +110,7 @@ def arguments() -> argparse.Namespace:
 
 
 def main() -> int:
-    """Fit every direction, save after each."""
+    """Fits every direction and saves after each one."""
     a = arguments()
     results: dict[str, Any] = {"benchmark": "B15", "rows": {}, "whole": {}}
     if a.out.is_file():
@@ -123,7 +124,7 @@ def main() -> int:
         if a.only and name not in a.only:
             continue
         base = machine.model()
-        # The same runs with a signal, which these models do not take, are no further fits.
+        # Machines with signals have the same runs as others, and these models do not use the signals.
         if machine.with_signals or not {"hub", "axis"} & set(base.mechanism.port_vectors):
             continue
         for way in machine.ways():

@@ -1,16 +1,21 @@
-"""A measured rotary flexible joint: two runs under two controllers, one held out at a time.
+"""B1: searches and fits on a measured rotary flexible joint, two runs under two controllers.
 
-Needs the `rotflex` recordings: `rotflex data fetch rotflex`, or a folder named by `ROTFLEX_DATA`.
-`python benchmarks/B1_rotflex.py` does all of it; `search`, `fits` or `figures` does one part. Prints the
-tables of the README and of docs/measured_joint.md, writes `results/B1.json` and `docs/figures/`.
+    python benchmarks/B1_rotflex.py                  # all parts
+    python benchmarks/B1_rotflex.py search figures   # some
 
-    search   discovery: which effects are missing, on each way of holding data out
-    repeats  how far the same step, made twice in one run, differs from itself
-    arm      the joint by itself: the arm behind the measured hub, with one law after the other
-    fits     named structures by an integrator of its own, fitted for free runs of 2 s; what differs between
-             the runs
-    play     the same with play in the gear
-    figures  from the results of `fits`
+Models are fitted to one run (A or B) and evaluated on the other. Searches are also fitted to the first 7 s of
+both runs and evaluated on the last 3 s, given structures also to both whole runs.
+
+    search   searches for missing effects
+    repeats  difference between two equal steps in one run, as a measure of how repeatable the machine is
+    arm      the arm behind the measured hub, with one law of the joint after the other
+    fits     given structures, fitted to free runs of 2 s with a separate integrator
+             (measured_joint/fine_run.py), also to both runs with separate friction levels and offsets
+    play     such fits of structures with play in the gear
+    figures  the figures of docs/measured_joint.md, from the results of `fits`
+
+Needs the `rotflex` recordings: `rotflex data fetch rotflex`, or a folder named by `ROTFLEX_DATA`. Prints
+tables in Markdown and writes `results/B1.json`; results of parts that are not run again are kept.
 """
 
 import json
@@ -36,7 +41,7 @@ def degrees(errors) -> str:
 
 
 def search(A: rf.Recording, B: rf.Recording) -> dict:
-    """Discovery, as a user meets it."""
+    """Searches by `rf.discover` with its default settings."""
     (A1, A2), (B1, B2) = A.split(0.7), B.split(0.7)
     cases = {
         "A to B": (A, B),
@@ -61,7 +66,7 @@ def search(A: rf.Recording, B: rf.Recording) -> dict:
 
 
 def fits(A: rf.Recording, B: rf.Recording) -> dict:
-    """Named structures: learnt from one run and judged on the other, on both, and on the same run."""
+    """Structures of `fine_run`, fitted to one run or to both, and evaluated on each run."""
     runs, out = {"A": A, "B": B}, {}
     print(
         "\n| structure | from | judged on | no offset | its own offset | whole, its own offset | offset [V] |"
@@ -75,7 +80,7 @@ def fits(A: rf.Recording, B: rf.Recording) -> dict:
             for key, run in runs.items():
                 bare = found.numbers[learnt[0]] | {"offset": 0.0, "bias": 0.0}
                 own = found.numbers.get(key)
-                if own is None:  # one number, fitted to the run that is judged
+                if own is None:  # only the offset is fitted to the run of the evaluation
                     own = fine_run.fit({key: run}, (), ("offset",), bare, lugre).numbers[key]
                 rows[key] = {
                     "no_offset": fine_run.rms(bare, lugre, run),
@@ -93,7 +98,7 @@ def fits(A: rf.Recording, B: rf.Recording) -> dict:
 
 
 def repeats(A: rf.Recording, B: rf.Recording) -> dict:
-    """How far the same step, made twice in one run, differs from itself, voltage of the feedback included."""
+    """Difference between two equal steps in one run [deg]; the voltages of the feedback differ as well."""
     out = {}
     for name, run in (("A", A), ("B", B)):
         windows = np.degrees(run.y[: 5 * fine_run.WINDOW]).reshape(5, fine_run.WINDOW, 2)
@@ -107,7 +112,7 @@ def repeats(A: rf.Recording, B: rf.Recording) -> dict:
 
 
 def differences(A: rf.Recording, B: rf.Recording) -> dict:
-    """Both runs fitted together, friction levels and offsets each run's own."""
+    """Both runs fitted together, with separate friction levels, offsets and biases."""
     free = [k for k in fine_run.STRUCTURES[fine_run.TAKEN] if k not in ("level", "rise")]
     own = ("level", "rise", "offset", "bias")
     found = fine_run.fit({"A": A, "B": B}, free, own)
@@ -121,7 +126,7 @@ def differences(A: rf.Recording, B: rf.Recording) -> dict:
 
 
 def arm(A: rf.Recording, B: rf.Recording) -> dict:
-    """Laws of the joint, each learnt from one run and judged on both."""
+    """Laws of the joint, each fitted to one run and evaluated on both."""
     out = arm_alone.compare({"A": A, "B": B})
     print("\n| law of the joint | from A: A / B [deg] | from B: A / B [deg] |\n|---|---|---|")
     for law in arm_alone.LAWS:

@@ -1,10 +1,15 @@
-"""B2: the numbers that worked the seed paper through, by this package and by independent prototypes.
+"""B2: errors, step sizes and learning times for the seed paper, beside those of independent prototypes.
 
     python benchmarks/B2_seed_paper.py
     python benchmarks/B2_seed_paper.py --only 2.4 3 --quick
 
-Tables that the results file has already are kept, unless they are named by `--only` or `--fresh` is
-given. Writes the numbers to `results/B2.json` and a page to `results/B2.md`.
+The seed paper adapts a Volterra model of a flexible joint by LMS (docs/seed_paper.md). Each table of
+`seed_paper` computes values about such models with this package and compares them with values that
+prototypes without this package computed (`seed_paper/reference.json`), within a stated tolerance.
+
+Tables that the results file already contains are kept, unless `--only` names them or `--fresh` is given.
+Writes the values to `results/B2.json` and a page to `results/B2.md`. The exit status is 1 if a difference
+beyond the tolerance has no explanation.
 """
 
 from __future__ import annotations
@@ -33,13 +38,13 @@ TABLES = {
     "3": "pulses",
     "4": "tuning",
 }
-"""Section of the worked paper -> module of `seed_paper`."""
+"""Number of a table -> module of `seed_paper` that computes it."""
 
 from rotflex_jax.text.files import write_file
 
 
 def table(section: str, quick: bool) -> dict[str, Any]:
-    """One table, with its references beside it."""
+    """Computes one table and compares it with its references."""
     began = time.perf_counter()
     module = importlib.import_module(f"seed_paper.{TABLES[section]}")
 
@@ -52,7 +57,7 @@ def table(section: str, quick: bool) -> dict[str, Any]:
 
 
 def summary(found: dict[str, Any]) -> str:
-    """How many numbers agree, and which do not."""
+    """How many values are within tolerance, and which differ without an explanation."""
     cells = [
         c for b in found["blocks"] for row in b["rows"].values() for c in row.values() if "reference" in c
     ]
@@ -80,7 +85,7 @@ def arguments() -> argparse.Namespace:
 
 
 def main() -> int:
-    """Compute what is missing, save after each table, print what agrees."""
+    """Computes missing tables, saves after each one, and prints which values agree."""
     a = arguments()
     from rotflex_jax.runtime.xla import enable_fast_loops
 

@@ -1,12 +1,15 @@
-"""B3: discovery on public machines by their official protocols, beside published numbers.
+"""B3: errors of searches on public machines by their official protocols, beside published errors.
 
     python benchmarks/B3_public.py
     python benchmarks/B3_public.py --only silverbox emps --fresh
 
-EMPS and the Silverbox are evaluated on their official tests, the rotary arm on runs that were left out. Needs
-the recordings: `rotflex data fetch emps silverbox rotary_arm`, or a folder named by `ROTFLEX_DATA`. Cases
-that `results/B3.json` has already are kept unless `--fresh` is given. Writes `results/B3.json` and the page
-`results/B3.md`.
+The Silverbox and EMPS are fitted to the official training records (of the Silverbox, to the first 16,000
+samples) and evaluated by free runs over the official test records. The rotary arm is fitted to one run and
+evaluated on other runs (rigid), or fitted to the first 70 % of a run and evaluated on the rest (flexible).
+
+Needs the recordings: `rotflex data fetch emps silverbox rotary_arm`, or a folder named by `ROTFLEX_DATA`.
+Writes `results/B3.json` and the page `results/B3.md`. Cases that the file already contains are kept unless
+`--fresh` is given.
 """
 
 from __future__ import annotations

@@ -1,13 +1,15 @@
-"""Is the next experiment worth what it promises? Played on the independent simulator.
+"""B4: whether a designed experiment distinguishes two effects as well as predicted, and better than others.
 
     python benchmarks/B4_next_experiment.py --seeds 1000 1001 1002
 
-A machine hides one effect of a pair; an ordinary recording of it takes 20 s at about 1 V rms.
-The model is fitted to that recording with the true effect; `next_experiment` ranks the standard inputs and
-designs a better one within the same limits. Then the design and the best of the ranking are played on the
-machine, with fresh sensor noise, and both hypotheses are refitted to each new recording. The margin is the
-difference of what they are worth: log-likelihood (Gaussian, its sigma re-estimated) less half of BIC's
-penalty. Writes results/B4.json and results/B4.md.
+Each simulated machine hides the first effect of a pair. Its ordinary recording has 20 s of noise with about
+1 V rms, to which a model with the true effect is fitted. From this fit, `next_experiment` ranks standard
+inputs and designs an input within the same limits. The design and the best inputs of the ranking are then
+played on the simulator with new sensor noise, and the models with the true effect and with its rival are
+fitted to each new recording. The margin is the difference of their evidence: Gaussian log-likelihood with
+re-estimated standard deviations, less half of the penalty of BIC. It is compared with the prediction.
+
+Writes results/B4.json and results/B4.md.
 """
 
 from __future__ import annotations
@@ -39,8 +41,8 @@ from rotflex_jax.text.files import write_file
 TS, SECONDS = 0.002, 20.0
 LIMITS = Limits(voltage=6.0, travel=np.deg2rad(90), deflection=np.deg2rad(10))
 
-# Pair: the effect that the machine has, its numbers, and its rival; the first two so small that the
-# ordinary recording tells little.
+# Pair: the effect that the machine has, its parameters, and its rival. Effects of the first two pairs are so
+# small that the ordinary recording hardly distinguishes them from the rival.
 PAIRS = {
     "delay or lag": (("delay", "input"), {"time": 0.0012}, ("lag", "input")),
     "second mode or sensor gain": (
@@ -55,12 +57,12 @@ PAIRS = {
         ("sensor_cubic", "alpha"),
     ),
 }
-# Standard inputs that are played: the best by the ranking. The others are ranked only.
+# Number of standard inputs that are played, the best of the ranking.
 PLAYED = 6
 
 
 def recorded(truth: tuple, numbers: dict, seed: int, played: np.ndarray | None = None) -> rf.Recording:
-    """What the machine of a seed answers to ordinary noise, or to a voltage."""
+    """Recording of the machine of a seed under ordinary noise, or under a given voltage."""
     r = make_record({truth: numbers}, kind="noise", seed=seed, seconds=SECONDS, played=played)
     return rf.Recording(u=r["u"], y=r["y"], Ts=r["Ts"], source="arena")
 
@@ -68,8 +70,9 @@ def recorded(truth: tuple, numbers: dict, seed: int, played: np.ndarray | None =
 def evidence(rival: RivalModel, rec: rf.Recording, noise: np.ndarray) -> tuple[float, bool]:
     """Log-likelihood of a recording less half of BIC's penalty [nat], and whether the fit converged.
 
-    Gaussian, the standard deviation of each channel re-estimated, constants left out. First state, offset,
-    bias and every parameter of the machine are fitted to this recording, from several shapes of the effect.
+    The likelihood is Gaussian, with re-estimated standard deviations and without constants. First state,
+    offset, bias and every parameter of the machine are fitted to this recording, from several shapes of the
+    effect.
     """
     found = best_rival_fit(rival, rec.u, rec.y, TS, [rival.start, *starts_with_other_shapes(rival)])
     errors = np.mean(np.square(found.residuals * noise), axis=0)
@@ -138,7 +141,7 @@ def trial(name: str, seed: int, starts: int, say) -> dict:
 
 
 def summary(rows: list[dict]) -> str:
-    """Markdown: per pair the design beside the standard input that turned out best."""
+    """Markdown: for each pair and seed, the design and the standard input with the largest margin."""
     V, travel, deflection = LIMITS.voltage, np.rad2deg(LIMITS.travel), np.rad2deg(LIMITS.deflection)
     lines = [
         "# The next experiment, played on the independent simulator",

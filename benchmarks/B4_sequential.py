@@ -1,21 +1,23 @@
-"""Seconds on the rig until it is decided: experiments that stop by themselves beside standard inputs.
+"""B4: time on the rig until rival effects are distinguished, by sequential experiments and standard inputs.
 
     python benchmarks/B4_sequential.py --seeds 2000 2001 2002 2003 2004 --hopeless 2002 2003 --workers 16
 
-A machine of the independent simulator hides one effect; an ordinary recording of 6 s at about 1 V rms hardly
-says which of two or three it is. Each rival is fitted to that recording, and all start equally probable. Then
-`experiment_until` plays on the simulator and evaluates what was recorded every 0.1 s, until one has the
-probability 99 %.
+A machine of the independent simulator hides one effect. An ordinary recording of 6 s with about 1 V rms
+hardly distinguishes it from one or two rivals. The models with the hidden effect and with each rival are
+fitted to that recording, and all are equally probable at first. `experiment_until` then chooses and plays
+segments on the simulator and evaluates the data every 0.1 s, until one model has a probability of 99 %.
 
-Beside it the standard inputs, without a pause and evaluated by the same rule: of each kind (multisine, binary
-sequence, sweep, steps, noise) the setting and level with which the fitted models expect to be told apart
-soonest. From one second on they are evaluated at fewer moments, and the earliest possible one counts. Two
-comparisons are made: with one kind for all cases, the one whose median is least, and with the kind that
-turned out fastest in each case, which nobody knows beforehand. Last, cases that no input within the limits
-can tell: does the loop say so.
+Standard inputs are played on the same machine, without a pause, and evaluated by the same rule: of each
+kind (multisine, binary sequence, sweep, steps, noise) the setting and level with the least expected time to
+a decision under the fitted models. Beyond one second they are evaluated at fewer times, and a decision is
+counted at the earliest time that is possible. The sequential experiment is compared with the one kind whose
+median time over all cases is least, and with the kind that was fastest in each case, which is known only in
+hindsight. `--hopeless` adds cases that no input within the limits can decide, for which the right verdict
+is `not distinguishable`.
 
-Writes results/B4_sequential.json and .md after each case; rows that are there are kept, so that a run that
-was stopped goes on. Processes share compiled programs where ROTFLEX_PROGRAMS names a folder.
+Writes results/B4_sequential.json and .md after each case. Rows of the file are kept unless `--fresh` is
+given, so that an interrupted run continues. Processes share compiled programs if ROTFLEX_PROGRAMS names a
+folder.
 """
 
 from __future__ import annotations
@@ -46,14 +48,15 @@ from rotflex_jax.text.files import write_file
 
 TS, ORDINARY, MOST, SEGMENT, CHECK, ERROR = 0.002, 6.0, 20.0, 0.5, 0.1, 0.01
 LIMITS = rf.Limits(voltage=6.0, travel=np.deg2rad(90), deflection=np.deg2rad(10))
-# Within these nothing moves far beyond the noise.
+# Limits of hopeless cases: within them, nothing moves far beyond the noise.
 NARROW = rf.Limits(voltage=0.3, travel=np.deg2rad(5), deflection=np.deg2rad(0.3))
-# Moments at which a standard input is evaluated [s]; the earliest since the one before counts.
+# Times at which a standard input is evaluated [s]. A decision counts `CHECK` after the time before, which is
+# the earliest possible time of a decision.
 MOMENTS = (*(k * CHECK for k in range(1, 11)), 1.2, 1.5, 1.8, 2.2, 2.6, 3.2)
 MOMENTS += (4, 5, 6, 7, 8, 10, 12, 14, 17, 20)
 KINDS = ("multisine", "prbs", "sweep", "steps", "noise")
 
-# The effect that is there with its numbers, and its rivals.
+# The hidden effect, its parameters, and its rivals.
 CASES = {
     "delay or lag": (("delay", "input"), {"time": 4.5e-4}, [("lag", "input")]),
     "lag or delay": (("lag", "input"), {"time": 5e-4}, [("delay", "input")]),
@@ -92,7 +95,7 @@ NOISE = dict.fromkeys(("theta", "alpha"), math.hypot(JITTER, COUNT / math.sqrt(1
 
 
 class ArenaRig(Rig):
-    """The independent simulator as a rig whose motion goes on."""
+    """The independent simulator as a rig whose motion continues from segment to segment."""
 
     def __init__(self, truth: tuple, numbers: dict, seed: int, limits: rf.Limits) -> None:
         self.limits, self.Ts, self.continues = limits, TS, True
@@ -100,13 +103,13 @@ class ArenaRig(Rig):
         self.clean = np.zeros((0, 2))
 
     def play(self, u: np.ndarray) -> np.ndarray:
-        """From rest with all voltages so far, since the simulator begins there; noise as it was."""
+        """Simulates all voltages so far from rest, with the same noise, and returns the new samples."""
         self.played = np.concatenate([self.played, u])
         return recorded(*self.given, self.played)[1][-len(u) :]
 
 
 def recorded(effects: dict, seed: int, played: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Voltage and outputs of the machine of a seed, with sensor noise of its own."""
+    """Voltage and outputs of the machine of a seed, with sensor noise from a separate random stream."""
     r = make_record(effects, seed=seed, played=played, fs=1 / TS)
     rng = np.random.default_rng([seed, 4])
     noisy = r["clean"] + JITTER * rng.standard_normal((len(played), 2))
@@ -114,7 +117,7 @@ def recorded(effects: dict, seed: int, played: np.ndarray) -> tuple[np.ndarray, 
 
 
 def fits(truth: tuple, numbers: dict, rivals: list, seed: int) -> dict[str, rf.Fit]:
-    """Each model fitted to an ordinary recording."""
+    """Fits of the true model and of each rival to an ordinary recording, by name."""
     r = make_record({truth: numbers}, kind="noise", seed=seed, seconds=ORDINARY)
     first = rf.Recording(u=r["u"], y=r["y"], Ts=r["Ts"], source="arena")
     joint = rf.fit(rf.joints.paper(), first).model
@@ -125,7 +128,7 @@ def fits(truth: tuple, numbers: dict, rivals: list, seed: int) -> dict[str, rf.F
     return found
 
 
-# Starts of rivals that are far from small in the catalogue.
+# Small starts of rivals whose default sizes in the catalogue are large.
 SMALL = {
     "lag": lambda at: CATALOG["lag"](at=at, time=5e-4),
     "delay": lambda at: CATALOG["delay"](at=at, time=5e-4),
@@ -138,7 +141,7 @@ SMALL = {
 
 
 def standard(N: int, seed: int) -> list[tuple[str, str, np.ndarray]]:
-    """Standard inputs of the whole length, at the limit of the voltage."""
+    """Kind, setting and voltage of standard inputs of N samples, scaled to the limit of the voltage."""
     V, out = LIMITS.voltage, []
     for corner in (2.0, 5.0, 15.0, 40.0):
         u = excitation.noise(N, TS, rms=V / NOISE_CREST, bandwidth=corner, seed=seed)
@@ -157,7 +160,7 @@ def standard(N: int, seed: int) -> list[tuple[str, str, np.ndarray]]:
 
 
 def best_standard(start: SequentialExperiment, seed: int) -> list[tuple[str, str, np.ndarray]]:
-    """Of each kind the setting and level that are expected to decide soonest, always within the limits."""
+    """Of each kind the setting and level with the least expected time to a decision, within the limits."""
     long = SequentialExperiment(
         start.rivals, type(start.settings)(LIMITS, segment_seconds=MOST, improve=False), start.prior
     )
@@ -170,7 +173,7 @@ def best_standard(start: SequentialExperiment, seed: int) -> list[tuple[str, str
         for (k, s, _), u, good in zip(made, U, ok, strict=True)
         if good
     ]
-    # As the loop: none that moves hardly more than the noise.
+    # Like the sequential experiment, leave out inputs that move little more than the noise.
     seen = choice.loud(np.array([u for *_, u in offered]))
     offered = [o for o, good in zip(offered, seen, strict=True) if good]
     parts = tuple(t / MOST for t in MOMENTS)
@@ -184,7 +187,7 @@ def best_standard(start: SequentialExperiment, seed: int) -> list[tuple[str, str
 
 
 def played_standard(start: SequentialExperiment, rig: ArenaRig, u: np.ndarray) -> dict:
-    """Seconds until a standard input decides, by the same rule."""
+    """Time until a standard input decides [s], by the rule of the sequential experiment."""
     _, y = recorded(*rig.given, u)
     before = 0.0
     e, r = start, start.rivals
@@ -249,31 +252,31 @@ def trial(name: str, seed: int, say, hopeless: bool = False, alone: bool = False
 
 
 def one(job: dict) -> dict:
-    """A case in a process of its own."""
+    """Row of a case, computed in a worker."""
     say = lambda text: print(text, flush=True)  # noqa: E731
     return trial(job["case"], job["seed"], say, job["hopeless"], job["alone"])
 
 
 def fastest(row: dict) -> dict:
-    """The standard input that decided rightly first; the whole time where none did."""
+    """The standard input with the earliest right decision; the longest time if there is none."""
     good = [s for s in row["standard"] if s["decided"] and s["best"] == row["truth"]]
     least = {"input": "none", "setting": "", "seconds": MOST, "decided": False}
     return min(good, key=lambda s: s["seconds"]) if good else least
 
 
 def own_seconds(row: dict) -> float:
-    """Seconds of the loop, of a case that has to be decided; the whole time where it did not, or wrongly."""
+    """Time to a right decision by the sequential experiment [s]; the longest time if there is none."""
     good = row["verdict"] == "decided" and row["best"] == row["truth"]
     return row["seconds"] if good else MOST
 
 
 def ratio(row: dict) -> float:
-    """Seconds of the best standard input over those of the loop."""
+    """Time of the fastest standard input over the time of the sequential experiment."""
     return fastest(row)["seconds"] / own_seconds(row)
 
 
 def of_kinds(rows: list[dict]) -> dict[str, dict[str, float]]:
-    """Each kind of standard input by itself: what decides nothing or wrongly counts as the whole time."""
+    """Each kind of standard input separately; without a right decision, the longest time counts."""
     found = {}
     for kind in KINDS:
         played = [(r, s) for r in rows for s in r["standard"] if s["input"] == kind]
@@ -292,7 +295,7 @@ def of_kinds(rows: list[dict]) -> dict[str, dict[str, float]]:
 
 
 def totals(rows: list[dict]) -> dict:
-    """Counts and medians over all cases: those that can be decided, and those that cannot."""
+    """Counts and medians over all cases, separately for decidable and hopeless ones."""
     told, lost = ([r for r in rows if r["hopeless"] == h] for h in (False, True))
     decided = [r for r in told if r["verdict"] == "decided"]
     played = [(s, r["truth"]) for r in told for s in r["standard"]]
@@ -326,7 +329,7 @@ def totals(rows: list[dict]) -> dict:
 
 
 def page(rows: list[dict]) -> str:
-    """Markdown."""
+    """Markdown of the tables."""
     t = totals(rows)
     lines = [
         "# Seconds on the rig until it is decided",
@@ -394,7 +397,7 @@ def main() -> None:
     results: dict[str, Any] = {"schema": 1, "rows": []}
     if file.exists() and not given.fresh:
         results |= json.loads(file.read_text())
-    # First of all, since results that are written make the tree a changed one.
+    # Before anything is written, since written results change the working tree.
     made, rows = begin(results, __file__, sys.argv[1:]), results["rows"]
     have = {(r["case"], r["seed"], r["hopeless"]) for r in rows}
     todo: list[B0.Job] = [
@@ -404,12 +407,12 @@ def main() -> None:
         for name in names
         if (name, seed, lost) not in have
     ]
-    # Those of three models take longest and begin first.
+    # Cases with three models take longest and are started first.
     todo.sort(key=lambda job: -len((HOPELESS if job["hopeless"] else CASES)[job["case"]][2]))
     print(f"{len(todo)} cases to play", flush=True)
     for job, row in B0.rows(todo, given.workers, one):
         name = f"{job['case']} {job['seed']}"
-        if "error" in row:  # is tried again next time
+        if "error" in row:  # the next run repeats it
             print(f"{name}: {row['error']}", flush=True)
             continue
         print(f"{name}: {row['verdict']} after {row['seconds']:g} s ({row['elapsed_s']:.0f} s)", flush=True)

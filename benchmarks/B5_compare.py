@@ -1,14 +1,18 @@
-"""Every method on the same recordings: measured joints, public benchmarks, a simulated joint with friction.
+"""B5: errors of all methods of `rf.compare` on the same recordings, measured and simulated.
 
-    python benchmarks/B5_compare.py                            what is not done yet, of all data sets
-    python benchmarks/B5_compare.py emps rotary_arm            of these
+    python benchmarks/B5_compare.py                            missing rows of all data sets
+    python benchmarks/B5_compare.py emps rotary_arm            missing rows of these data sets
     python benchmarks/B5_compare.py emps --methods sindy arx   these methods again
-    python benchmarks/B5_compare.py --draw                     tables and figures only, of what is done
+    python benchmarks/B5_compare.py --draw                     only tables and figures of finished rows
 
-Needs the recordings of `rotflex data fetch`, or a folder named by `ROTFLEX_DATA`; what is missing is left
-out with its reason. Writes `results/B5/NAME.json`, `NAME.md` and two figures each, and `summary.md` for all.
-Every row is kept in `results/B5/kept` as soon as it is there, with the page of each data set, so that
-an interrupted run goes on where it stopped. Methods without a long search come first.
+Data sets are the measured rotary joint (three splits), a simulated joint with friction, the rotary arm,
+EMPS and the Silverbox. Every method is fitted to the same training data and evaluated by free runs over the
+same held-out data.
+
+Needs the recordings of `rotflex data fetch`, or a folder named by `ROTFLEX_DATA`; a data set whose
+recordings are missing is left out, and the reason is printed. Writes `results/B5/NAME.json`, `NAME.md` and
+two figures for each data set, and `summary.md` for all. Every row is stored in `results/B5/kept` as soon as
+it is finished, so that an interrupted run continues. Methods without a long search are run first.
 """
 
 import argparse
@@ -30,12 +34,12 @@ from rotflex_jax.text.markup import write_files
 HERE = pathlib.Path(__file__).parent
 RESULTS = HERE / "results" / "B5"
 KEPT = RESULTS / "kept"
-# Longer recordings are learnt from in part: a regression gains nothing more, and a fit takes minutes.
+# Longest training recording [samples]: more samples do not improve regressions, and fits would take minutes.
 LONGEST = 16_000
 
 
 def measured(which: str) -> tuple:
-    """The rotary flexible joint: one run fitted and the other evaluated on, or the ends of both."""
+    """The rotary flexible joint: one run for fits and the other for evaluation, or the two parts of both."""
     A, B = rf.data.load_dataset("rotflex")
     joint = rf.joints.quanser_2010()
     if which == "mixed":
@@ -45,16 +49,16 @@ def measured(which: str) -> tuple:
 
 
 def public(name: str) -> tuple:
-    """A public benchmark with its official recordings to evaluate on."""
+    """A public benchmark with its official test recordings."""
     benchmark = rf.data.benchmark(name)
     train, machine = benchmark.train, getattr(rf.joints, name)()
-    if name == "silverbox":  # its input was measured behind a filter, and runs on between samples
+    if name == "silverbox":  # its input was measured behind a filter and is smooth between samples
         machine = rf.Model(machine, rf.Exponential(order=4, substeps=2, between="smooth"))
     return machine, [train.slice(0, min(train.N, LONGEST))], list(benchmark.tests.values())
 
 
 def arm() -> tuple:
-    """A geared motor with a rigid arm, measured: one controller fitted, two others evaluated on."""
+    """A measured geared motor with a rigid arm: one run for fits, two with other gains for evaluation."""
     _, slow, fast, other = rf.data.load_dataset("rotary_arm")
     return rf.joints.rotary_arm(), [slow], [fast, other]
 
@@ -78,12 +82,12 @@ SETS: dict[str, Callable[[], tuple]] = {
     "silverbox": lambda: public("silverbox"),
 }
 
-# What the errors of a data set are told in, and how many of these make one of its own units.
+# Unit in which the errors of a data set are shown, and factor from the unit of its channels.
 UNITS = dict.fromkeys(SETS, ("deg", math.degrees(1.0))) | {"emps": ("mm", 1e3), "silverbox": ("mV", 1e3)}
 
 
 def learn(name: str, method: str) -> None:
-    """One row, kept without what the method learnt."""
+    """Computes and stores one row, without the fitted model."""
     machine, train, test = SETS[name]()
     say = lambda text: print(f"  {name}: {text}", flush=True)  # noqa: E731
     found = rf.compare(train, [method], mechanism=machine, test=test, progress=say)
@@ -100,7 +104,7 @@ def learn(name: str, method: str) -> None:
 
 
 def draw(name: str) -> None:
-    """Table, figures and page of the rows that are there."""
+    """Writes table, figures and page of the finished rows of a data set."""
     kept = [KEPT / name / f"{m}.pickle" for m in METHODS]
     parts: list[Comparison] = [pickle.loads(file.read_bytes()) for file in kept if file.exists()]
     if not parts:
@@ -119,10 +123,10 @@ def draw(name: str) -> None:
 
 
 def made_by(kept: list[pathlib.Path]) -> dict[str, Any]:
-    """The runs that learnt rows, and what they measure."""
+    """Runs of this script that computed rows, and the source files that these rows measure."""
     found: dict[str, Any] = {"runs": [], "sources": {}}
     for file in (k.with_suffix(".json") for k in kept if k.exists()):
-        # What was learnt before results said what made them counts as of a tree that was changed.
+        # A row without such a record counts as measured with uncommitted changes.
         of = json.loads(file.read_text()) if file.exists() else {"runs": [{}], "sources": {}}
         found["runs"] += of["runs"]
         found["sources"] |= of["sources"]
@@ -130,7 +134,7 @@ def made_by(kept: list[pathlib.Path]) -> dict[str, Any]:
 
 
 def summary() -> str:
-    """One free run over all that is held out, of every method on every data set that is done."""
+    """Table of errors of whole free runs over held-out data, of every method on every finished data set."""
     files = {name: RESULTS / f"{name}.json" for name in SETS}
     done = {name: json.loads(file.read_text()) for name, file in files.items() if file.exists()}
     rows = {name: {row["method"]: row for row in found["rows"]} for name, found in done.items()}

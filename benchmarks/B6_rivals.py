@@ -1,12 +1,16 @@
-"""Other ways to find the hidden effect, on the same records as B0, marked by the same rules.
+"""B6: other methods that name the hidden effect, on the recordings of B0, scored by the same rules.
 
     python benchmarks/B6_rivals.py --tuning --seeds 100 --workers 2
     python benchmarks/B6_rivals.py --seeds 1002 --rivals "refit + BIC" --workers 16 --minutes 5
 
-The search's own row comes from the results of B0 (run that first, with the same arguments); nothing
-is recomputed that is in the results already, and the tables are of all that is there. The structure
-that a rival names is fitted by the grey box, so its held-out error is that of its answer and not of
-its arithmetic.
+The methods are forward selection with full refits, regressions, SINDy and a neural torque
+(`rotflex_jax.arena.rivals`). Each method is given training and validation data and names effects. The grey
+box then fits the structure that was named, so that the validation error is that of the named structure and
+does not depend on how the method computes. It is compared with the error of the true structure.
+
+The row of the search is taken from the results of B0, which must be run first with the same seeds and
+inputs. Writes `results/B6.json` and `results/B6.md`. Rows that the results already contain are kept, and
+the tables cover all rows.
 """
 
 from __future__ import annotations
@@ -54,7 +58,7 @@ from rotflex_jax.text.files import write_file
 
 
 def one(job: Job) -> dict[str, Any]:
-    """A rival on a record; imports late, after the settings of the process."""
+    """Row of a method on a recording; imports follow the settings of the process."""
     import rotflex_jax as rf
     from arena.trial import SPLIT, recording, windows_error
     from rotflex_jax.arena.marking import scored, visible
@@ -79,19 +83,19 @@ def one(job: Job) -> dict[str, Any]:
         for name, port in answer.rounds:
             model = model + CATALOG[name](at=port)
         row["windows"] = windows_error(rf.fit(model, train).model, test)
-    except Exception as problem:  # the benchmark reports it and goes on
+    except Exception as problem:  # recorded as a row with its error
         row["error"] = f"{type(problem).__name__}: {problem}"
         row["traceback"] = traceback.format_exc()
     return row
 
 
 def key(job: Job) -> str:
-    """Name of a row in the results."""
+    """Key of a row in the results."""
     return f"{job['rival']}|{B0.key(job)}"
 
 
 def marks(own: dict[str, dict[str, Any]], records: dict[str, dict[str, Any]]) -> dict[str, Any]:
-    """Sums over the records of one method; `own` are its rows, `records` those of B0 with the oracle."""
+    """Counts and medians over the rows `own` of one method; `records` are the rows of B0, with the oracle."""
     good = {k: r for k, r in own.items() if "error" not in r}
     seen = {k: r for k, r in good.items() if r["wanted"] and not r["outside"]}
     null = [r for r in good.values() if not r["wanted"]]
@@ -115,7 +119,7 @@ def marks(own: dict[str, dict[str, Any]], records: dict[str, dict[str, Any]]) ->
 
 
 def table(summary: dict[str, dict[str, Any]]) -> Table:
-    """One row a method."""
+    """Table with one row for each method."""
     out = Table(title="B6: one hidden effect, every method", header_style="bold")
     for name in COLUMNS:
         out.add_column(name)
@@ -125,7 +129,7 @@ def table(summary: dict[str, dict[str, Any]]) -> Table:
 
 
 def cells(name: str, s: dict[str, Any]) -> list[str]:
-    """One row as text."""
+    """Cells of the row of one method."""
     part = lambda pair: f"{pair[0]}/{pair[1]}"  # noqa: E731
     number = lambda x: "-" if x is None else f"{x:.2f}"  # noqa: E731
     counts = [part(s[k]) for k in ("first", "exact", "false_alarms", "unexplained")]
@@ -134,7 +138,7 @@ def cells(name: str, s: dict[str, Any]) -> list[str]:
 
 
 def page(summary: dict[str, dict[str, Any]], earlier: list[str]) -> str:
-    """Markdown of the table; `earlier` are methods with rows from before they had these columns."""
+    """Markdown of the table, with notes; `earlier` are remarks on methods that are left out."""
     head = "| " + " | ".join(COLUMNS) + " |\n|---|" + "---:|" * (len(COLUMNS) - 1)
     rows = ["| " + " | ".join(cells(name, s)) + " |" for name, s in summary.items()]
     notes = [
@@ -157,7 +161,7 @@ def page(summary: dict[str, dict[str, Any]], earlier: list[str]) -> str:
 
 
 def main() -> int:
-    """Run what is missing, save after each row, print the table."""
+    """Runs missing rows, saves after each one, and prints the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--tuning", action="store_true", help="tuning seeds (report seeds if not)")
     parser.add_argument("--seeds", default="", help="as 1000,1001; the first if omitted")
@@ -188,7 +192,7 @@ def main() -> int:
     base = B0.jobs(whole, seeds, [a.input])
     wanted = [{**job, "rival": name} for job in base for name in rivals]
     known = results["rows"]
-    # Rows from before the dictionaries had states of their own say nothing of these methods.
+    # Rows without this mark are from regressions without columns for internal states, and are computed again.
     todo = [j for j in wanted if not known.get(key(j), {}).get("states")]
     console = Console(highlight=False)
     console.print(f"{len(wanted)} rows, {len(todo)} to run")

@@ -1,11 +1,15 @@
-"""How quick filters, simulation and fits are, beside C, numba and the libraries that people use.
+"""B7: time of filters, simulations, fits and searches, beside C, numba and other libraries.
 
     python benchmarks/B7_speed.py                       # everything
-    python benchmarks/B7_speed.py --only lms motion     # some subsets; the others stay as they were
+    python benchmarks/B7_speed.py --only lms motion     # some subsets; results of the others are kept
     python benchmarks/B7_speed.py --plain --only lms    # without the compiler's option for small loops
 
-Everything compared is timed in one process, in turn and in random order; compiling is apart. Where others
-use the machine too, only the ratios of minima within one subset tell something.
+The cases of a subset that are compared with each other are timed in one process, in turn and in random
+order; the first call, which compiles, is timed separately. Subsets that measure new processes or whole
+searches start processes. If other programs use the machine, only the ratios of minima within one subset are
+meaningful.
+
+Writes `results/B7.json` and the page `results/B7.md`; with `--plain` only `results/B7_plain.json`.
 """
 
 from __future__ import annotations
@@ -46,7 +50,7 @@ def main() -> None:
 
 
 def run(chosen: argparse.Namespace) -> None:
-    """Measures, and keeps what was measured before of the other subsets."""
+    """Measures the chosen subsets and keeps earlier results of the others."""
     from rich.progress import Progress
 
     from speed import table
@@ -65,7 +69,7 @@ def run(chosen: argparse.Namespace) -> None:
 
 
 def machine() -> dict[str, Any]:
-    """What it ran on."""
+    """Processor, versions and date of the run."""
     import jax
 
     model = [x for x in Path("/proc/cpuinfo").read_text().splitlines() if x.startswith("model name")]
@@ -81,7 +85,7 @@ def machine() -> dict[str, Any]:
 def compared(
     groups: list[list[Any]], chosen: argparse.Namespace, progress: Any, title: str
 ) -> dict[str, Any]:
-    """Groups of cases, each timed together; the noise of the machine beside."""
+    """Times of groups of cases, each group timed together, and the noise of these times."""
     from speed.rounds import noise, timed
 
     found = []
@@ -190,7 +194,7 @@ def _growth(chosen: argparse.Namespace, progress: Any) -> dict[str, Any]:
     bar = progress.add_task("growth", total=len(WORK) * len(lengths))
     found: dict[str, Any] = {}
     for work in WORK:
-        # A recording of ten million samples is no recording any more.
+        # Fits are left out at the greatest length, which no recording has.
         for N in lengths if work != "two runs of a fit" else lengths[:-1]:
             found.setdefault(work, {})[str(N)] = grown(work, N)
             progress.advance(bar)

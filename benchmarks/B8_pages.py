@@ -1,12 +1,16 @@
-"""The smaller measurements that pages of the documentation quote, each on its own page.
+"""B8: smaller measurements that the documentation quotes.
 
     python benchmarks/B8_pages.py                  # all parts
     python benchmarks/B8_pages.py kernels fleet    # some
 
-`kernels`: which effect changes which Volterra kernel, and the kernels of least squares beside those of
-averages. `measured`: kernels of the measured joint beside those of its grey box. `torque`: what learned
-torques reach on records of the arena. `fleet`: what the machinery around the searches of a fleet costs.
-Writes results/B8.json, part by part.
+- `kernels`: share of a single effect in each Volterra kernel of the flexible joint, and agreement of kernels
+  by least squares with kernels by averages.
+- `measured`: kernels of the measured joint beside those of its fitted grey box.
+- `torque`: errors of short free runs over simulated held-out data, without and with a learned torque.
+- `fleet`: processor time of everything around the searches of many recordings.
+
+`measured` needs the `rotflex` recordings. Writes results/B8.json after each part; results of parts that are
+not run again are kept.
 """
 
 from __future__ import annotations
@@ -41,7 +45,8 @@ from rotflex_jax.text.files import write_file
 RESULT = Path(__file__).resolve().parent / "results" / "B8.json"
 TS = 0.05
 
-# One effect each on the paper's joint; the last is an offset on a joint that has friction already.
+# Effects added to the joint of the paper; the share is that of the last one. The last case is an offset on a
+# joint with friction.
 SHARES: dict[str, tuple[fx.Effect, ...]] = {
     "coulomb hub": (fx.Coulomb("hub", level=0.03),),
     "coulomb joint": (fx.Coulomb("joint", level=0.003),),
@@ -59,7 +64,7 @@ SHARES: dict[str, tuple[fx.Effect, ...]] = {
     "unequal coulomb": (fx.CoulombAsymmetric("hub", forward=0.045, backward=0.015),),
     "offset with friction": (fx.Coulomb("hub", level=0.03), fx.VoltageOffset(offset=0.3)),
 }
-# Hidden at the hub -> an effect of the arena, or none; `new positions` evaluates where nothing was trained.
+# Name of a case -> effect of the simulator at the hub and its parameters, or nothing.
 HIDDEN: dict[str, dict] = {
     "friction": {("coulomb", "hub"): {"level": 0.03}},
     "drag": {("quadratic_drag", "hub"): {"coefficient": 0.008}},
@@ -112,7 +117,7 @@ def measured() -> dict[str, Any]:
     )
     agreement = mine.against(data)
     upper = np.triu_indices(memory)
-    told = data.errors[1][upper] > 0  # the first lags of poles without a direct way are zero for certain
+    told = data.errors[1][upper] > 0  # without feedthrough, the kernel is exactly zero at the first lags
     # A Gaussian voltage of the same size and bandwidth, and a stronger one.
     rms = float(np.sqrt(np.mean(np.concatenate([r.u for r in short]) ** 2)))
     friction = {}
@@ -135,7 +140,7 @@ def measured() -> dict[str, Any]:
 
 
 def torque() -> dict[str, Any]:
-    """Errors of short held-out runs in multiples of the noise, without and with a learned torque."""
+    """Errors of short free runs over held-out data, over the noise, without and with a learned torque."""
     rows = {}
     for name, hidden in HIDDEN.items():
         made = make_record(hidden, seed=101, seconds=20.0)
@@ -154,7 +159,7 @@ def torque() -> dict[str, Any]:
 
 
 def _known(model: Any, train: Any, test: Any) -> SimpleNamespace:
-    """A search that takes no time."""
+    """A search that returns a constant result at once."""
     errors = {"held_out_rmse": {"theta": 1.0, "alpha": 1.0}}
     errors["held_out_rmse_windows"] = {"seconds": 2.0, "theta": 1.0, "alpha": 1.0}
     floor = {"theta": 5e-4, "alpha": 5e-4}
@@ -163,7 +168,7 @@ def _known(model: Any, train: Any, test: Any) -> SimpleNamespace:
 
 
 def fleet() -> dict[str, Any]:
-    """Processor time per recording [s] of everything but the search, and where the answer is known."""
+    """Processor time for each recording without its search [s], in a first call and with stored results."""
     count, rng = 2000, np.random.default_rng(3)
     recordings = []
     for _ in range(count):
@@ -187,7 +192,7 @@ PARTS: dict[str, Callable[[], dict[str, Any]]] = {
 
 
 def main() -> None:
-    """Run the parts that were asked for."""
+    """Runs the chosen parts."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n", 1)[0])
     parser.add_argument("parts", nargs="*", help=f"among {', '.join(PARTS)}; all unless given")
     chosen = parser.parse_args().parts or list(PARTS)
@@ -196,7 +201,7 @@ def main() -> None:
     for name in chosen:
         try:
             found = PARTS[name]()
-        except InputError as reason:  # measured data that are not here
+        except InputError as reason:  # measured recordings are missing
             print(f"{name}: {reason}")
             continue
         kept[name] = found

@@ -1,4 +1,4 @@
-"""B9: every measured machine, every direction, evaluated on recordings used for no fit and no choice.
+"""B9: searches on every measured machine, evaluated on test data that were used for no fit and no choice.
 
     python benchmarks/B9_measured.py
     python benchmarks/B9_measured.py --only rotflex two_dof_link_1
@@ -6,14 +6,19 @@
     python benchmarks/B9_measured.py --workers 16
     python benchmarks/B9_measured.py --list
 
-The ends of the training runs decide (validation); the test recordings have no other use. Free runs over the
-whole test and over windows of 2 s, with and without the voltage offset that is fitted to the first 2 s of a
-test. A search runs in a new process with nothing compiled, and once more in another one with what the first
-has compiled. Beside it is the best of the other methods (`rotflex_jax.compare`) on the same data. With
-several workers each direction has a core, all share what they compile, and no times are reported.
+A direction is a split of the recordings of a machine into training, validation and test data. The search is
+fitted to training data and decides on validation data. Errors are those of free runs over the whole test
+recordings and over windows of 2 s, with and without a voltage offset that is fitted to the first 2 s of
+each test recording. Other methods (`rotflex_jax.compare`) are fitted to the same training and validation
+data, and the best one is shown beside the search.
 
-Needs the recordings, fetched or in the folder named by `ROTFLEX_DATA`. Writes `results/B9.json` after each
-direction, and the page `results/B9.md`; directions that the file has are kept unless `--fresh` is given.
+The search runs in a new process without compiled programs, and again in another new process that uses the
+compiled programs of the first. With several workers, each direction has one core, all share compiled
+programs, and no times are reported.
+
+Needs the recordings, fetched or in the folder named by `ROTFLEX_DATA`. Writes `results/B9.json` and the page
+`results/B9.md` after each direction. Directions that the file already contains are kept unless `--fresh` is
+given.
 """
 
 from __future__ import annotations
@@ -47,7 +52,7 @@ CHILD = "from measured_machines.child import main; main()"
 
 
 def directions(only: list[str]) -> tuple[list[tuple[str, str]], dict[str, str]]:
-    """All (machine, direction) that are wanted, and machines that are left out with the reason."""
+    """Chosen pairs of machine and direction, and machines that are left out with the reason."""
     wanted, left_out = list[tuple[str, str]](), dict[str, str]()
     for name, machine in MACHINES.items():
         chosen = [o for o in only if o == name or o.startswith(f"{name}: ")]
@@ -65,7 +70,7 @@ def directions(only: list[str]) -> tuple[list[tuple[str, str]], dict[str, str]]:
 def side_by_side(
     todo: list[tuple[str, str]], methods: list[str], workers: int
 ) -> Iterator[tuple[str, str, dict[str, Any]]]:
-    """Directions as they are ready, each in a process on a core of its own; without times."""
+    """Yields finished directions; each runs in a process on a separate core, and times are left out."""
     free = queue.SimpleQueue[int]()
     for core in sorted(os.sched_getaffinity(0))[:workers]:
         free.put(core)
@@ -90,7 +95,7 @@ def side_by_side(
 
 
 def measured(machine: str, direction: str, methods: list[str], warm: bool) -> dict[str, Any]:
-    """One direction: everything in a new process, then the search again in another; a failure is a row."""
+    """Row of a direction: all in a new process, the search again in another; or the error of a process."""
     with tempfile.TemporaryDirectory() as cache:
         try:
             first = process(CHILD, machine, direction, "cold", *methods, cache=cache, show=True)
@@ -98,7 +103,7 @@ def measured(machine: str, direction: str, methods: list[str], warm: bool) -> di
         except subprocess.CalledProcessError as problem:
             return {"error": f"the process ended with {problem.returncode}"}
     times = lambda found: {k: found.pop(k) for k in ("clock_s", "processor_s")}  # noqa: E731
-    for found in (first, again or {}):  # of the whole process
+    for found in (first, again or {}):  # times of the whole process
         found.pop("clock", None)
         found.pop("processor", None)
     row = {"machine": machine, "direction": direction, "cold": times(first), **first}
@@ -127,7 +132,7 @@ def arguments() -> argparse.Namespace:
 
 
 def main() -> int:
-    """Run what is missing, save after each direction."""
+    """Runs missing directions and saves after each one."""
     a = arguments()
     wanted, left_out = directions(a.only)
     if a.only and not wanted and not left_out:

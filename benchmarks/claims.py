@@ -1,4 +1,7 @@
-"""Texts for documents that take a count, a median or several numbers from the results of benchmarks."""
+"""Texts for the documents that are computed from results of benchmarks: counts, medians, tables.
+
+`quoted.py` writes them into the documents, between marks with the name of the function.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +25,7 @@ from speed.table import waiting
 
 RESULTS = Path(__file__).resolve().parent / "results"
 
-# Name -> the text that stands between the marks of that name.
+# Name -> function that returns the text between the marks with this name.
 NAMED: dict[str, Callable[[], str]] = {}
 
 
@@ -39,7 +42,7 @@ def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 ASKED: set[str] = set()
-"""Files of results that were asked for since this was last emptied."""
+"""Names of the results files that `results` returned since this set was last emptied."""
 
 
 def results(file: str) -> Any:
@@ -57,7 +60,7 @@ def _read(file: str) -> Any:
 
 
 def _worlds(marked: str, seen: bool = False, kind: str | None = None) -> tuple[int, int]:
-    """Number of wrong worlds with a mark, and number of all; worlds whose mark is None do not count."""
+    """Number of wrong worlds in which the entry `marked` is true, and number where it is not None."""
     every = results("B0_wrong_worlds.json")["records"].values()
     rows = [r for r in every if (r["world"] in SEEN_WORLDS) is seen and r.get(marked) is not None]
     rows = [r for r in rows if kind in (None, r["kind"])]
@@ -319,7 +322,7 @@ MEASURED_DIRECTIONS = {
     "bam_xl330: gain 800 to gains 100 to 400": "XL-330, gain 800 to gains 100 to 400",
     "so101: random motion to steps": "SO-101, elbow, random motion to steps",
 }
-"""Directions of the table of the model to use, in its words."""
+"""Directions in the table of the model to use -> their labels there."""
 _OF_STAGES = {
     "lqr, first half to its end": "2026, first half to its end",
     "feedback, first half to its end": "2011, first half to its end",
@@ -376,7 +379,7 @@ def _in_degrees(errors: dict[str, float], stage: int | None = None) -> str:
 
 
 LINEAR = ("arx", "subspace", "state_space")
-"""Linear methods of `compare` that know no physics; they take signals as further inputs."""
+"""Linear methods of `compare` without a physical model; signals are further inputs to them."""
 
 
 def _best_linear(row: dict[str, Any]) -> str:
@@ -488,13 +491,16 @@ for _which, _name in enumerate(("once", "restarted")):
 # -- the arena ----------------------------------------------------------------------------------------------
 
 SEEN = (1000, 1001)
-"""Seeds of records that were looked at while the search was revised; what is quoted is of the others."""
+"""Seeds of recordings that were read during revisions of the search.
+
+Quoted figures are of the other recordings.
+"""
 
 
 def records(
     *, outside: bool = False, hidden: bool = True, effects: int = 1, size: float = 1.0
 ) -> list[dict[str, Any]]:
-    """Records whose seeds were not looked at in a revision of the search.
+    """Records whose seeds were not read in a revision of the search.
 
     By default these are records with known effects: `effects` of them at once, of the share `size` of their
     usual size, with both sensors. With `outside` they have an effect that the catalogue lacks; with
@@ -761,7 +767,7 @@ def emps_parameters() -> str:
 
 @named
 def rigid_arm_errors() -> str:
-    """Errors of free runs of the rigid arm, learnt from the run with gain 6 [mrad]."""
+    """Errors of free runs of the rigid arm, fitted to the run with gain 6 [mrad]."""
     case = results("B3.json")["rigid arm"]
     first, *found = case["rows"]
     by_search = found[: len(case["rounds"])]
@@ -875,7 +881,7 @@ def fleet_million() -> str:
 
 @named
 def fleet_workers() -> str:
-    """How many workers one command can feed, for each second that a search takes, in two digits."""
+    """Number of workers that one command can supply, for each second that a search takes, to two digits."""
     return f"{float(format(1 / results('B8.json')['fleet']['searched'], '.2g')):,.0f}"
 
 
@@ -920,8 +926,8 @@ for _hidden in ("friction", "drag", "uneven friction", "nothing"):
 
 # -- other ways to find the effect --------------------------------------------------------------------------
 
-# This method fits every candidate with the simulator of this package. It is no independent tool, so it is
-# counted separately.
+# This method fits every candidate with the simulator of this package. It is not independent of the package
+# and therefore counted separately.
 REFITS = "refit + BIC"
 
 
@@ -1022,12 +1028,12 @@ def rivals_nothing() -> str:
     return str(_search()["false_alarms"][1])
 
 
-# -- how sure ------------------------------------------------------------------------------------------------
+# -- certainty ----------------------------------------------------------------------------------------------
 
 
 @named
 def certainty_cost() -> str:
-    """Processor time of profiles, what can be known, bands and probabilities: the least and the most [s]."""
+    """Processor time of profiles, identifiability, bands and probabilities: smallest and largest [s]."""
     each = [parts["all"] for parts in results("B11.json")["summary"]["cost"].values()]
     return f"{min(each):.0f} to {max(each):.0f} s"
 
@@ -1036,9 +1042,9 @@ def certainty_cost() -> str:
 
 
 def _until_decided(kind: str) -> list[tuple[float, float]]:
-    """Times to a decision with a kind of standard input and with the loop, in each decidable case [s].
+    """Times to a decision with a kind of standard input and with the sequential experiment, by case [s].
 
-    An experiment that decides nothing, or decides wrongly, counts with the longest time.
+    Hopeless cases are left out. Without a right decision, the longest time counts.
     """
     found = results("B4_sequential.json")
     rows, most = [r for r in found["rows"] if not r["hopeless"]], 20.0
@@ -1053,7 +1059,7 @@ def _kind_seconds(kind: str) -> str:
 
 
 def _kind_ratio(kind: str) -> str:
-    """Median over the cases of the time with a kind of standard input over the time of the loop."""
+    """Median over cases of the time with a kind of standard input over that of the sequential experiment."""
     return f"{statistics.median(a / b for a, b in _until_decided(kind)):.1f}"
 
 
@@ -1065,15 +1071,16 @@ def _best_kind() -> str:
 
 
 def _medians() -> str:
-    """Median time of the best kind of standard input over the median time of the loop."""
+    """Median time of the best kind of standard input over the median time of the sequential experiment."""
     summary = results("B4_sequential.json")["summary"]
     return f"{summary['kind_seconds'] / summary['seconds']:.1f}"
 
 
 def _slow_ratio() -> str:
-    """Median ratio of times of the fastest standard input and the loop, where the input takes over 1 s.
+    """Median of the time of the fastest standard input over that of the sequential experiment.
 
-    Which standard input is the fastest in a case is known only in hindsight.
+    Only cases count in which the standard input takes more than 1 s. Which standard input is the fastest in a
+    case is known only in hindsight.
     """
     ratios = []
     for row in results("B4_sequential.json")["rows"]:
@@ -1094,7 +1101,7 @@ for _kind in ("multisine", "prbs", "sweep", "steps", "noise"):
 
 
 def _next_ratio(pair: str) -> str:
-    """Worth of a design over the worth of the best standard input: smallest and largest ratio."""
+    """Margin with the design over the margin with the best standard input: smallest and largest ratio."""
     ratios = []
     for row in results("B4.json")["rows"]:
         if row["pair"] == pair:
@@ -1114,7 +1121,7 @@ NAMED["next_ratio_mode"] = functools.partial(_next_ratio, "second mode or sensor
 
 
 WITH_SLOPES = 3.5
-"""Processor time of a free run with its derivatives by some seven parameters, in runs without."""
+"""Processor time of a free run with derivatives by about seven parameters, over that of a run without."""
 
 
 @named
@@ -1304,43 +1311,43 @@ def _fresh_mutants() -> list[dict[str, Any]]:
 
 @named
 def mutants_drawn() -> str:
-    """Number of mutants: changes of a constant or an operator in modules that decide."""
+    """Number of mutants: changes of a constant or an operator in modules that make decisions."""
     return str(len(_mutants()))
 
 
 @named
 def mutants_first() -> str:
-    """Number of mutants that the tests noticed when the mutants were drawn."""
+    """Number of mutants that the tests detected when the mutants were drawn."""
     return str(sum(r["first"] for r in _mutants()))
 
 
 @named
 def mutants_noticed() -> str:
-    """Number of mutants that the tests notice now."""
+    """Number of mutants that the tests detect now."""
     return str(sum(r["noticed"] for r in _mutants()))
 
 
 @named
 def mutants_same() -> str:
-    """Number of mutants that change nothing."""
+    """Number of mutants that do not change any result."""
     return str(sum("equivalent" in r for r in _mutants()))
 
 
 @named
 def mutants_fresh() -> str:
-    """Number of mutants of a second sample that the tests noticed when they were drawn, of all."""
+    """Number of mutants of a second sample that the tests detected when they were drawn, of all."""
     rows = _fresh_mutants()
     return f"{sum(r['first'] for r in rows)} of {len(rows)}"
 
 
 @named
 def mutants_fresh_same() -> str:
-    """Number of mutants of the second sample that change nothing."""
+    """Number of mutants of the second sample that do not change any result."""
     return str(sum("equivalent" in r for r in _fresh_mutants()))
 
 
 @named
 def mutants_fresh_share() -> str:
-    """Share of mutants noticed when drawn, in the second sample without those that change nothing [%]."""
+    """Share of mutants detected when drawn, in the second sample without those that change no result [%]."""
     rows = [r for r in _fresh_mutants() if "equivalent" not in r]
     return f"{100 * sum(r['first'] for r in rows) / len(rows):.0f}"

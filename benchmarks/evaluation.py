@@ -1,4 +1,4 @@
-"""Searches evaluated on test data: what was named, and free runs with and without calibration.
+"""Searches evaluated on test data: effects that were named, and errors of free runs with and without offset.
 
 Shared by B0 (wrong worlds) and B9 (measured machines).
 """
@@ -18,7 +18,7 @@ from rotflex_jax.text.numbers import json_numbers
 
 ESTABLISHED, PROVISIONAL = "established", "provisional"
 WINDOW = 2.0
-"""Length of the short free runs, and of the beginning that an offset is found on [s]."""
+"""Length of the short free runs, and of the beginning of a recording to which an offset is fitted [s]."""
 
 # Number of offsets on a grid; half width of the first grid as a share of the largest voltage; number of
 # grids, each finer than the one before.
@@ -35,7 +35,7 @@ def searched(
     test: Recordings,
     progress: Callable[[str], None] | None = None,
 ) -> rf.Discovery:
-    """A search; it is given the test recordings if its version of `rf.discover` can report errors on them."""
+    """Runs a search; `rf.discover` is given the test recordings if its version can report errors on them."""
     parameters = inspect.signature(rf.discover).parameters
     knows_test = "test" in parameters and "validation" in parameters
     options: dict[str, Any] = {"test": list(test)} if knows_test else {}
@@ -61,7 +61,7 @@ def named(result: rf.Discovery) -> list[dict[str, Any]]:
 
 
 def errors(model: rf.Model | Callable[[rf.Recording], rf.Model], recordings: Recordings) -> dict[str, Any]:
-    """Root mean square errors of free runs over recordings that the model has not seen.
+    """Root mean square errors of free runs over recordings to which the model was not fitted.
 
     Args:
         model: fitted model, or a function that gives the model of a recording.
@@ -69,8 +69,8 @@ def errors(model: rf.Model | Callable[[rf.Recording], rf.Model], recordings: Rec
 
     Returns:
         `whole` and `windows` (of `WINDOW` seconds) by channel; `whole_calibrated` and `windows_calibrated`
-        with the voltage offset of each recording, found on its first `WINDOW` seconds; `offsets` [V].
-        Errors that are not finite, and calibrations of machines that have no voltage, are None.
+        with a voltage offset for each recording, fitted to its first `WINDOW` seconds; `offsets` [V].
+        Errors that are not finite are None, and so are calibrated errors of machines that accept no offset.
     """
     bare = [(model if isinstance(model, rf.Model) else model(r), r) for r in recordings]
     own = [(calibrated(m, r), r) for m, r in bare]
@@ -86,8 +86,8 @@ def errors(model: rf.Model | Callable[[rf.Recording], rf.Model], recordings: Rec
 def calibrated(model: rf.Model, recording: rf.Recording) -> tuple[rf.Model, float] | None:
     """The model with a voltage offset that is fitted to the beginning of a recording, and the offset [V].
 
-    The offset has the least squared error of the first channel over the first `WINDOW` seconds, on grids that
-    are refined. It replaces an offset that the model already has. None if the machine accepts no offset.
+    The offset minimises the squared error of the first channel over the first `WINDOW` seconds, on refined
+    grids. It replaces an offset that the model already has. None if the machine accepts no offset.
     """
     name = "input.voltage_offset.offset"
     try:

@@ -1,14 +1,16 @@
-"""Damaged files of every format that is read, results of a fleet and lines of the command line.
+"""Fuzz test: damaged files of every input format, damaged results of a fleet, and damaged command lines.
 
-Each must end as a recording, a model, a page or `InputError`, a line with status 0 or 2 and one sentence.
+A file must either be read or be refused with an `InputError` of one sentence. A command line must end with
+status 0, or with status 2 and one sentence.
 
-    python benchmarks/fuzz_input.py                        # 2,000 of each format
+    python benchmarks/fuzz_input.py                        # 2,000 files of each format
     python benchmarks/fuzz_input.py --count 200 --formats mat hdf5
-    python benchmarks/fuzz_input.py --first 100000         # others than those
+    python benchmarks/fuzz_input.py --first 100000         # other files
 
-Small files are made here and changed: bits, bytes, numbers that tell a size, blocks cut, put in or repeated;
-inside the compressed parts too. A process of its own reads them, since a fault may end it, under a limit
-of memory and of time. The table counts how they end; the exit status is 1 where one ends in any other way.
+Small valid files are made and then changed at random, also inside their compressed parts: single bits and
+bytes, sizes of blocks, and blocks that are cut out, inserted or repeated. A separate process reads them
+under limits of memory and time, because a fault may end it. The table counts the outcomes; the exit status
+is 1 if there is any fault.
 """
 
 from __future__ import annotations
@@ -38,19 +40,19 @@ from typing import Any
 import numpy as np
 
 SECONDS = 5
-"""Time that one file may take [s]."""
+"""Longest time for one file [s]."""
 
 MEMORY = 1_500_000_000
-"""Memory that reading may take beyond what the imported packages take [bytes]."""
+"""Largest memory for reading, in addition to that of the imported packages [bytes]."""
 
 MAX_BYTES = 300_000_000
-"""Limit that the reader is given [bytes]."""
+"""Value of `max_bytes` for the reader [bytes]."""
 
 ALL_FAULTS = (
     *("short", "constant_input", "constant", "saturated", "units", "absolute", "swapped"),
     *("slow", "wrapped", "outliers", "frozen"),
 )
-"""Faults of the signals are accepted, so that what is read gets as far as it can."""
+"""Faults of signals that are accepted, so that reading does not stop at them."""
 
 
 def columns(samples: int = 60) -> dict[str, np.ndarray]:
@@ -61,7 +63,7 @@ def columns(samples: int = 60) -> dict[str, np.ndarray]:
 
 
 def json_seeds() -> list[bytes]:
-    """A list of samples beside settings, one of their values a list; and lists under names."""
+    """A list of samples beside a setting, where one value of a sample is a list; and lists under names."""
     found = {name: values.tolist() for name, values in columns().items()}
     samples = [dict(zip(found, row, strict=True)) for row in zip(*found.values(), strict=True)]
     more = [row | {"effort": [0.1, 0.2], "mode": "a"} for row in samples]
@@ -69,7 +71,7 @@ def json_seeds() -> list[bytes]:
 
 
 def csv_seeds() -> list[bytes]:
-    """Commas, semicolons with decimal commas and a line of units, spaces below remarks."""
+    """With commas; with semicolons, decimal commas and a line of units; with spaces, after comments."""
     rows = np.column_stack(list(columns().values())).tolist()
     plain = ["t,voltage,theta,alpha", *(",".join(f"{x:.6g}" for x in row) for row in rows)]
     german = ["t;voltage;theta;alpha", "s;V;rad;rad", *(line.replace(".", "_") for line in plain[1:])]
@@ -79,7 +81,7 @@ def csv_seeds() -> list[bytes]:
 
 
 def npz_seeds() -> list[bytes]:
-    """Stored and compressed."""
+    """An archive without and one with compression."""
     found = []
     for write in (np.savez, np.savez_compressed):
         write(out := io.BytesIO(), **columns(), log=np.ones((60, 3), np.float32), kind=np.array("run 7"))  # type: ignore[arg-type]
@@ -109,7 +111,7 @@ def mat_seeds() -> list[bytes]:
 
 
 def timetable_seed() -> bytes:
-    """Version 5 with a timetable and the signals beside it."""
+    """Version 5 with a timetable and separate signals."""
     import matio
     import pandas as pd
 
@@ -122,7 +124,7 @@ def timetable_seed() -> bytes:
 
 
 def hdf5_seeds() -> list[bytes]:
-    """As MATLAB 7.3 writes it, and with chunks, groups, a named type and a compound type."""
+    """A file like those of MATLAB 7.3, and one with chunks, groups, a named type and a compound type."""
     import h5py
 
     found = []
@@ -145,7 +147,7 @@ def hdf5_seeds() -> list[bytes]:
 
 
 def xlsx_seeds() -> list[bytes]:
-    """Two sheets, the first one empty; with a line of units."""
+    """Two sheets, the first one empty, the second with a line of units."""
     import openpyxl
 
     book = openpyxl.Workbook()
@@ -159,7 +161,7 @@ def xlsx_seeds() -> list[bytes]:
 
 
 def parquet_seeds() -> list[bytes]:
-    """Numbers; and text, lists, dates, whole numbers with gaps."""
+    """Columns of numbers; and also of text, lists, dates, and integers with gaps."""
     import pyarrow
     import pyarrow.parquet
 
@@ -176,7 +178,7 @@ def parquet_seeds() -> list[bytes]:
 
 
 def tdms_seeds() -> list[bytes]:
-    """Waveforms, and a channel of times beside whole numbers and text."""
+    """Waveforms; and a channel of times with integers and text."""
     import nptdms
 
     found = []
@@ -194,7 +196,7 @@ def tdms_seeds() -> list[bytes]:
 
 
 def mdf_seeds() -> list[bytes]:
-    """Plain and packed, one group and two."""
+    """One group without compression, and two groups with two kinds of compression."""
     import asammdf
 
     found = []
@@ -211,7 +213,7 @@ def mdf_seeds() -> list[bytes]:
 
 
 def mcap_seeds() -> list[bytes]:
-    """Joint states and a number, plain and packed."""
+    """Messages with a number and messages with lists, with each kind of compression."""
     from mcap.writer import CompressionType
     from mcap_ros2.writer import Writer
 
@@ -233,7 +235,7 @@ def mcap_seeds() -> list[bytes]:
 
 
 def model_seeds() -> list[bytes]:
-    """A small joint, and one with effects, gates and a covariance."""
+    """A small joint, and one with an effect, an estimate and a covariance."""
     from rotflex_jax.effects import Coulomb
     from rotflex_jax.joints import paper
     from rotflex_jax.models.model import Model
@@ -248,7 +250,7 @@ def model_seeds() -> list[bytes]:
 
 
 def fleet_seeds() -> list[bytes]:
-    """The file of a recording that a fleet has finished, and of one that it has refused."""
+    """Result files of a fleet: of a finished recording, and of a refused one."""
     from rotflex_jax.batch import storage
 
     parts = []
@@ -320,7 +322,7 @@ def command_seeds() -> list[bytes]:
 
 
 def mutated_command(data: bytes, pick: random.Random, text: bool) -> bytes:
-    """Words left out, doubled, exchanged with those of other lines, changed, or put in."""
+    """A command line with words that are left out, doubled, replaced, changed or inserted."""
     words = json.loads(data)
     others = [word for line in LINES for word in line.split()]
     for _ in range(pick.choice((1, 1, 2, 4))):
@@ -337,7 +339,7 @@ def mutated_command(data: bytes, pick: random.Random, text: bool) -> bytes:
             at %= len(words)
             cut = pick.randrange(len(words[at]) + 1)
             words[at] = words[at][:cut] + pick.choice(TOKENS) + words[at][cut + pick.randrange(3) :]
-    # Nothing is fetched here.
+    # The fuzz test must not download anything.
     return json.dumps([word for word in words if not word.startswith("fetch")]).encode()
 
 
@@ -350,7 +352,7 @@ def mutated(data: bytes, pick: random.Random, text: bool) -> bytes:
     """One to three changes of a file."""
     found = bytearray(data)
     for _ in range(pick.choice((1, 1, 1, 2, 3))):
-        # Headers stand at the ends of a file and steer what is read.
+        # Headers at the start and the end of a file determine how it is read.
         reach = pick.choice((len(found), len(found), 400))
         at = min(pick.randrange(reach + 1), max(len(found) - 1, 0))
         at = len(found) - 1 - at if pick.random() < 0.25 else at
@@ -374,7 +376,7 @@ def mutated(data: bytes, pick: random.Random, text: bool) -> bytes:
             other = pick.randrange(len(found) + 1)
             found[at : at + width] = found[other : other + width]
         else:
-            end = at = max(0, min(at, len(found)))  # nothing may be left
+            end = at = max(0, min(at, len(found)))  # the file may be empty
             while at and found[at - 1] not in b",;:[{ \n":
                 at -= 1
             while end < len(found) and found[end] not in b",;:]} \n":
@@ -384,7 +386,7 @@ def mutated(data: bytes, pick: random.Random, text: bool) -> bytes:
 
 
 def mutated_npz(data: bytes, pick: random.Random, text: bool) -> bytes:
-    """Changes of the archive, or of an array in it, which its checksum then fits."""
+    """Changes of the archive, or of a file in it, with a valid checksum."""
     if pick.random() < 0.4:
         return mutated(data, pick, text)
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
@@ -398,7 +400,7 @@ def mutated_npz(data: bytes, pick: random.Random, text: bool) -> bytes:
 
 
 def mutated_mat(data: bytes, pick: random.Random, text: bool) -> bytes:
-    """Changes of the file, or of a compressed variable in it, which its checksum then fits."""
+    """Changes of the file, or of a compressed variable in it, with a valid checksum."""
     if pick.random() < 0.4 or struct.unpack("<I", data[128:132])[0] != 15:
         return mutated(data, pick, text)
     found, at, parts = data[:128], 128, []
@@ -416,7 +418,14 @@ def mutated_mat(data: bytes, pick: random.Random, text: bool) -> bytes:
 
 @dataclasses.dataclass(frozen=True)
 class Format:
-    """How files of a format are made and changed."""
+    """How files of a format are made and changed.
+
+    Attributes:
+        ending: Suffix of the file.
+        seeds: Function that makes valid files.
+        change: Function that changes a file.
+        text: Whether the format is text.
+    """
 
     ending: str
     seeds: Callable[[], list[bytes]]
@@ -426,7 +435,7 @@ class Format:
 
 FORMATS = {
     "csv": Format(".csv", csv_seeds, text=True),
-    "json": Format(".JSON", json_seeds, text=True),  # in small letters it is read as a model
+    "json": Format(".JSON", json_seeds, text=True),  # a file with the suffix .json is read as a model
     "npz": Format(".npz", npz_seeds, mutated_npz),
     "mat": Format(".mat", mat_seeds, mutated_mat),
     "hdf5": Format(".mat", hdf5_seeds),
@@ -442,7 +451,7 @@ FORMATS = {
 
 
 def inputs(name: str, start: int, stop: int) -> Iterator[tuple[int, bytes]]:
-    """Changed files; each by its number alone, so that one can be made again."""
+    """Numbers and contents of changed files; a file depends on its number alone and can be made again."""
     form = FORMATS[name]
     seeds = form.seeds()
     for k in range(start, stop):
@@ -451,7 +460,7 @@ def inputs(name: str, start: int, stop: int) -> Iterator[tuple[int, bytes]]:
 
 
 def read(path: Path) -> Any:
-    """What a user would call."""
+    """Reads a file by the function that a user would call."""
     if path.suffix == ".row":
         return read_fleet(path)
     if path.suffix == ".line":
@@ -466,7 +475,7 @@ def read(path: Path) -> Any:
 
 
 def read_fleet(path: Path) -> Any:
-    """A fleet that finds this file of an earlier call, up to its pages."""
+    """A fleet that continues from this result file of an earlier call, up to its pages."""
     from types import SimpleNamespace
     from unittest import mock
 
@@ -488,14 +497,14 @@ def read_fleet(path: Path) -> Any:
 
 
 def made_once(path: Path) -> Path:
-    """A recording in a file."""
+    """Writes a valid recording to a file unless it exists, and returns its path."""
     if not path.exists():
         path.write_bytes(csv_seeds()[0])
     return path
 
 
 def run_command(path: Path) -> Any:
-    """A line of the command line, in a folder with one recording; what takes long is not run."""
+    """Runs a command line in a folder with one recording; searches, fits and simulations are not run."""
     from unittest import mock
 
     import rotflex_jax as rf
@@ -534,7 +543,7 @@ def run_command(path: Path) -> Any:
 
 
 def outcome(path: Path) -> str:
-    """How reading ends: read, refused, or the name of the fault."""
+    """Outcome of reading a file: "read", "refused", or "fault" with a description."""
     from rotflex_jax.errors import InputError
 
     try:
@@ -553,9 +562,9 @@ def outcome(path: Path) -> str:
 
 
 def work(name: str, start: int, stop: int, folder: Path) -> None:
-    """In a process of its own: reads the files one by one, and tells the outcome of each on stdout."""
+    """Reads changed files one by one in a worker process, and prints the outcome of each."""
     path = folder / f"input{FORMATS[name].ending}"
-    for seed in FORMATS[name].seeds():  # imports all that is needed, before memory is limited
+    for seed in FORMATS[name].seeds():  # imports the packages before memory is limited
         path.write_bytes(seed)
         assert outcome(path) == "read", (name, outcome(path))
     taken = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
@@ -564,14 +573,14 @@ def work(name: str, start: int, stop: int, folder: Path) -> None:
     for k, data in inputs(name, start, stop):
         path.write_bytes(data)
         print(k, "started", flush=True)
-        signal.alarm(SECONDS)  # ends the process, also where it hangs in a library
+        signal.alarm(SECONDS)  # ends the process even if a library hangs
         said = outcome(path)
         signal.alarm(0)
         print(k, said, flush=True)
 
 
 def run(name: str, count: int, folder: Path, first: int = 0) -> list[tuple[int, str]]:
-    """Number and outcome of each file of a format, from the first number on."""
+    """Number and outcome of `count` files of a format, beginning with the number `first`."""
     found: dict[int, str] = {}
     environment = os.environ | {"JAX_PLATFORMS": "cpu", "PYTHONWARNINGS": "ignore"}
     while len(found) < count:

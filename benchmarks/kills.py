@@ -1,11 +1,12 @@
-"""Kill real searches at random moments and go on: nothing lost, nothing twice, no damaged file read.
+"""Searches that are killed at random times and continued: no result may be lost, repeated or damaged.
 
     python benchmarks/kills.py [--kills 50] [--seed 0]
 
-Half of the kills hit a search that keeps its rounds and goes on from them (`--continue`), half a fleet of
-searches in a folder. The process gets SIGKILL, so nothing of it can clean up. After each kill every file that
-is in its place must be whole, rounds that were kept before must still be there, and recordings that were
-finished must stay as they are; a search that is left alone at last must end as one that nobody killed.
+Two kinds of processes are killed in turn: a search that stores its rounds and continues from them (as with
+`--continue` on the command line), and a fleet of searches in a folder. The process gets SIGKILL, so that it
+cannot clean up. After each kill, every file of results must be complete, rounds that were stored before
+must still be stored, and files of finished recordings must be unchanged. After one to four
+kills the process runs to its end, and its result must equal that of a process that was never killed.
 """
 
 import argparse
@@ -22,23 +23,23 @@ from pathlib import Path
 from typing import Any
 
 HERE = Path(__file__).resolve()
-sys.path.insert(0, str(HERE.parents[1] / "tests"))  # the spindle, a small machine
+sys.path.insert(0, str(HERE.parents[1] / "tests"))  # `spindle`, a small machine
 
 RECORDINGS, KILLS_IN_A_ROW = 3, 4
 LONGEST_WAIT = 1.0
-"""A process is killed up to so long after a line of progress [s]."""
+"""Longest time between a line of progress and a kill [s]."""
 
 
-# -- what is killed ---------------------------------------------------------------------------------
+# -- processes that are killed ----------------------------------------------------------------------
 
 
 def say(line: str) -> None:
-    """A line of progress, at once."""
+    """Prints the first line of a message at once."""
     print(line.partition("\n")[0], flush=True)
 
 
 def search(folder: Path) -> None:
-    """As the command line does it: rounds are kept, then the result is written, then the rounds removed."""
+    """Like the command line: rounds are stored, then the result is written, then the rounds are removed."""
     from spindle import PAIRS, SPINDLE, spun
 
     import rotflex_jax as rf
@@ -71,30 +72,30 @@ def fleet(folder: Path) -> None:
     rf.fleet(SPINDLE, recordings, folder=folder / "fleet", workers=0, search=run)
 
 
-# -- what is left -----------------------------------------------------------------------------------
+# -- their files ------------------------------------------------------------------------------------
 
 
 def kept_rounds(folder: Path) -> list[str]:
-    """Models of the rounds that a search has kept; a damaged file is an error."""
+    """Models of the rounds that a search has stored; a damaged file is an error."""
     file = folder / "found.stopped.json"
     return [entry["model"] for entry in json.loads(file.read_text())["stages"]] if file.exists() else []
 
 
 def finished(folder: Path) -> dict[str, tuple[int, dict[str, Any]]]:
-    """Results of a fleet that are in their places, with the time of each file."""
+    """Finished results of a fleet, each with the time of its file."""
     files = sorted((folder / "fleet" / "recordings").glob("[!.]*.json"))
     return {f.name: (f.stat().st_mtime_ns, json.loads(f.read_text())) for f in files}
 
 
 def essence(found: dict[str, Any]) -> tuple[Any, ...]:
-    """What a search says, without times and notes."""
+    """Verdict, effects and errors of a search, without times and notes."""
     rounds = [(r["effect"], r["port"]) for r in found["rounds"]]
     last = found["rounds"][-1] if rounds else found["baseline"]
     return found["verdict"], rounds, {c: float(f"{e:.2g}") for c, e in last["held_out_rmse"].items()}
 
 
 def outcome(kind: str, folder: Path) -> Any:
-    """Of a search or a fleet that has ended; every file of it is read."""
+    """Result of a search or a fleet that has ended; every file of it is read."""
     if kind == "search":
         assert not (folder / "found.stopped.json").exists(), "rounds were left behind"
         return essence(json.loads((folder / "found.json").read_text()))
@@ -110,11 +111,11 @@ def outcome(kind: str, folder: Path) -> Any:
     return found
 
 
-# -- the one who kills ------------------------------------------------------------------------------
+# -- the process that kills -------------------------------------------------------------------------
 
 
 def start(kind: str, folder: Path, programs: Path) -> subprocess.Popen[str]:
-    """A process that has loaded the package and begins."""
+    """Starts a process, and returns when it has loaded the package."""
     # Programs are compiled once, so that most of the time is the search.
     environment = os.environ | {"PYTHONPATH": str(HERE.parents[1]), "ROTFLEX_PROGRAMS": str(programs)}
     command = [sys.executable, str(HERE), "--victim", kind, str(folder)]
@@ -126,7 +127,7 @@ def start(kind: str, folder: Path, programs: Path) -> subprocess.Popen[str]:
 
 
 def to_its_end(kind: str, folder: Path, programs: Path) -> int:
-    """Lets one end by itself: how many lines of progress it had."""
+    """Runs a process to its end; returns the number of its lines of progress."""
     process = start(kind, folder, programs)
     said, _ = process.communicate()
     assert process.returncode == 0, (folder / "errors.log").read_text()
@@ -134,7 +135,7 @@ def to_its_end(kind: str, folder: Path, programs: Path) -> int:
 
 
 def killed(process: subprocess.Popen[str], lines: int, wait: float) -> bool:
-    """Kills a process so long after a line of progress; whether it had not ended before."""
+    """Kills a process some time after a number of lines of progress; False if it had ended before."""
     assert process.stdout is not None
     for _ in range(lines):
         process.stdout.readline()
@@ -150,7 +151,11 @@ def killed(process: subprocess.Popen[str], lines: int, wait: float) -> bool:
 def kills(
     number: int, seed: int, folder: Path, programs: Path, kinds: tuple[str, ...] = ("search", "fleet")
 ) -> Iterator[str]:
-    """So many kills, of each kind in turn; a line for each, an AssertionError where something was lost."""
+    """Performs a number of kills, of each kind in turn, and yields a line for each.
+
+    Raises:
+        AssertionError: A result was lost, repeated or damaged.
+    """
     draw = random.Random(seed)
     expected, lines = {}, {}
     for kind in kinds:
@@ -171,7 +176,7 @@ def kills(
             rounds, results = kept_rounds(place), finished(place)
             whole = (place / "found.json").exists() and bool(json.loads((place / "found.json").read_text()))
             assert whole or rounds[: len(rounds_before)] == rounds_before, (rounds_before, rounds)
-            # What was finished is neither lost nor searched again.
+            # A finished result is neither lost nor computed again.
             assert {name: results[name] for name in results_before} == results_before
             left = f"{len(rounds)} models kept" if kind == "search" else f"{len(results)} finished"
             if was_killed:

@@ -1,18 +1,20 @@
-"""Change one constant or operator of a module at a time and run its tests: which changes does no test notice?
+"""Mutation tests: change one constant or operator of a module at a time, and run the tests of the module.
 
     python benchmarks/mutants.py [--number 150] [--seed 21] [--only selection] [--again] [--store FILE]
     python benchmarks/mutants.py --workers 16 --seed 32 --fresh --store benchmarks/results/mutants_fresh.json
 
-The sample is fixed by its seed: as many places from each area of `AREAS`. Left out are annotations and what
-guards against a mistake of the programmer and changes no result (`strict` of zip, `frozen` of a dataclass).
-The working tree is copied, once for each worker. Each mutant is a process of its own at low priority that
-loads the module in its changed form, so the files stay as they are and compiled programs are found again; for
-modules that are traced into programs those are not kept. Tests stop at the first failure.
+What is measured is the share of changes at which a test fails. The places to change are sampled with a fixed
+seed, equally many from each area of `AREAS`. Annotations are never changed, nor are arguments that guard
+against mistakes of the programmer and do not affect results (`strict` of zip, `frozen` of a dataclass).
 
-Each answer is stored, and what is known of the same text of a module is not run again; `--again` runs those
-that survived once more, after tests were added ("first" is what came out when they were drawn). A survivor is
-to be read: it is a missing test, or it changes nothing that counts; then the reason goes into its row of the
-store, as "equivalent".
+The working tree is copied once for each worker. Each mutant runs in a separate process of low priority that
+loads the changed code of the module. The files do not change, so compiled programs can be reused; for modules
+that are traced into compiled programs, reuse is switched off. The tests stop at the first failure.
+
+Each result is stored, and a stored mutant of the same module text is not run again. `--again` repeats mutants
+that survived, for instance after tests were added; "first" in the store is the result of the first run.
+Inspect every survivor: either a test is missing, or the change has no effect that matters. In the second
+case, write the reason into its row of the store, as "equivalent".
 """
 
 import argparse
@@ -44,7 +46,7 @@ STORE = Path(__file__).with_name("results") / "mutants.json"
 
 
 class Tested(NamedTuple):
-    """A module, its tests (files, cheap ones first), and whether it is traced into programs."""
+    """A module, its test files (quick ones first), and whether JAX traces it into compiled programs."""
 
     module: str
     tests: tuple[str, ...]
@@ -76,7 +78,7 @@ AREAS: dict[str, tuple[Tested, ...]] = {
 
 
 class Job(NamedTuple):
-    """A mutant that is to be tried; without a place the module as it is."""
+    """A mutant to run; if `place` is None, the unchanged module."""
 
     area: str
     tested: Tested
@@ -84,7 +86,10 @@ class Job(NamedTuple):
 
 
 LEAST_LIMIT, LIMIT = 60.0, 6.0
-"""A mutant hangs, and counts as noticed, after so many seconds or times what its tests take."""
+"""Time limit of a mutant: at least so many seconds, and a multiple of the time of its tests.
+
+A mutant that reaches the limit counts as noticed.
+"""
 _GUARDS = ("strict", "frozen")
 _SWAPPED: dict[type[ast.AST], type[ast.AST]] = {
     ast.Lt: ast.LtE,
@@ -106,7 +111,7 @@ _SWAPPED: dict[type[ast.AST], type[ast.AST]] = {
 }
 
 
-# -- what is changed --------------------------------------------------------------------------------
+# -- places and changes -----------------------------------------------------------------------------
 
 
 def places(tree: ast.AST) -> Iterator[ast.AST]:
@@ -127,7 +132,11 @@ def places(tree: ast.AST) -> Iterator[ast.AST]:
 
 
 def mutant(text: str, number: int) -> tuple[ast.AST, int, str]:
-    """The tree of a text with one place changed, the line of it, and what was changed."""
+    """Syntax tree of a text with one place changed, the line of the change, and the change as text.
+
+    A truth value is negated, an integer increased by 1, another number multiplied by 1.5 (or set to 0.1 if it
+    is zero), and an operator replaced by the one in `_SWAPPED`.
+    """
     tree = ast.parse(text)
     node = list(places(tree))[number]
     before = ast.unparse(node)
@@ -148,7 +157,7 @@ def mutant(text: str, number: int) -> tuple[ast.AST, int, str]:
 
 
 def sample(number: int, seed: int) -> dict[str, list[tuple[Tested, int]]]:
-    """So many places in all, evenly from the areas: module and number of the place."""
+    """Random places, divided evenly among the areas: area -> modules and indices of places."""
     draw, drawn = random.Random(seed), dict[str, list[tuple[Tested, int]]]()
     left = number
     for k, (area, modules) in enumerate(AREAS.items()):
@@ -160,7 +169,7 @@ def sample(number: int, seed: int) -> dict[str, list[tuple[Tested, int]]]:
 
 
 def in_turn(drawn: dict[str, list[tuple[Tested, int]]]) -> Iterator[Job]:
-    """One of each area after the other, so that all have had some where it is stopped."""
+    """Jobs of all areas in turn, so that every area has results if the run is stopped early."""
     for row in itertools.zip_longest(
         *([Job(area, *place) for place in chosen] for area, chosen in drawn.items())
     ):
@@ -168,7 +177,7 @@ def in_turn(drawn: dict[str, list[tuple[Tested, int]]]) -> Iterator[Job]:
 
 
 def row_name(tested: Tested, number: int | None) -> str:
-    """Name of a mutant in the store: module, version of its text, place."""
+    """Key of a mutant in the store: module, digest of its text, place."""
     return f"{tested.module} {hashlib.sha256(source(tested).encode()).hexdigest()[:12]} {number}"
 
 
@@ -181,7 +190,7 @@ def source(tested: Tested) -> str:
 
 
 class Changed(SourceFileLoader):
-    """Finds one module by its name, and loads other code in its place."""
+    """Import hook that loads changed code for one module."""
 
     def __init__(self, name: str, path: str, code: CodeType) -> None:
         super().__init__(name, path)
@@ -193,7 +202,7 @@ class Changed(SourceFileLoader):
         return self._code
 
     def find_spec(self, name: str, path: Any = None, target: Any = None) -> ModuleSpec | None:
-        """Of this module alone."""
+        """Specification of this module; None for all others."""
         del path, target
         return (
             importlib.util.spec_from_file_location(name, self.path, loader=self)
@@ -203,7 +212,7 @@ class Changed(SourceFileLoader):
 
 
 def run_tests(folder: Path, tested: Tested, tree: ast.AST | None) -> int:
-    """Runs in the child: status of the tests; the module as it is where there is no tree."""
+    """Exit status of the tests, run in the child process; the module is unchanged if `tree` is None."""
     os.setpgid(0, 0)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     os.nice(10)
@@ -213,7 +222,7 @@ def run_tests(folder: Path, tested: Tested, tree: ast.AST | None) -> int:
         os.dup2(said.fileno(), 2)
     os.environ["PYTHONPATH"] = str(folder)
     if tested.traced:
-        os.environ["ROTFLEX_PROGRAMS"] = "off"  # they are known by the files, which do not change
+        os.environ["ROTFLEX_PROGRAMS"] = "off"  # stored programs are keyed by the files, which do not change
     sys.path[:0] = [str(folder)]
     name = "rotflex_jax." + tested.module.removesuffix(".py").replace("/", ".")
     if tree is not None:
@@ -222,7 +231,7 @@ def run_tests(folder: Path, tested: Tested, tree: ast.AST | None) -> int:
     importlib.import_module(name)
     import pytest
 
-    # Shapes are not checked, which saves time; so no mutant is noticed by a shape alone.
+    # Array shapes are not checked, to save time, so no mutant is noticed by a shape alone.
     options = [
         "-x",
         "-q",
@@ -231,20 +240,20 @@ def run_tests(folder: Path, tested: Tested, tree: ast.AST | None) -> int:
         "-o",
         "addopts=--import-mode=importlib --doctest-modules",
     ]
-    options += ["-W", "ignore::pytest.PytestAssertRewriteWarning"]  # of libraries that are loaded already
+    options += ["-W", "ignore::pytest.PytestAssertRewriteWarning"]  # for libraries that are already loaded
     files = [f"rotflex_jax/{tested.module}", *(f"tests/{test}" for test in tested.tests)]
     return int(pytest.main([*options, *files]))
 
 
 class Child(NamedTuple):
-    """A process that runs the tests of one mutant, or of the module as it is."""
+    """A process that runs the tests of one mutant, or of the unchanged module."""
 
     process: int
     begun: float
     limit: float
 
     def ended(self) -> bool | None:
-        """Whether tests failed or went on for longer than the limit; None while it runs."""
+        """Whether the tests failed or exceeded the time limit; None while they run."""
         done, status = os.waitpid(self.process, os.WNOHANG)
         if done:
             return status != 0
@@ -254,14 +263,14 @@ class Child(NamedTuple):
         return True
 
     def stop(self) -> None:
-        """End it and what it has started."""
+        """Stop the process and the processes that it started."""
         with contextlib.suppress(ProcessLookupError):
             os.killpg(self.process, signal.SIGKILL)
         os.waitpid(self.process, 0)
 
 
 def start(folder: Path, core: int | None, tested: Tested, tree: ast.AST | None, limit: float) -> Child:
-    """A child on a copy of the tree, on one core if one is given."""
+    """Start a child process on a copy of the tree, on one core if one is given."""
     process = os.fork()
     if not process:
         status = 1
@@ -269,7 +278,7 @@ def start(folder: Path, core: int | None, tested: Tested, tree: ast.AST | None, 
             if core is not None:
                 os.sched_setaffinity(0, {core})
             status = run_tests(folder, tested, tree)
-        except BaseException:  # a module that cannot be loaded is noticed
+        except BaseException:  # a module that cannot be loaded counts as noticed
             traceback.print_exc()
         sys.stdout.flush()
         sys.stderr.flush()
@@ -278,7 +287,7 @@ def start(folder: Path, core: int | None, tested: Tested, tree: ast.AST | None, 
 
 
 def done(jobs: Iterable[Job], folders: list[Path], limits: dict[Tested, float]) -> Iterator[tuple]:
-    """Job, whether it was noticed, seconds and its folder, as they end; one in each folder at a time."""
+    """Job, whether it was noticed, seconds and folder, as jobs end; each folder runs one job at a time."""
     waiting, free = iter(jobs), list(range(len(folders)))
     cores = sorted(os.sched_getaffinity(0))
     running: dict[int, tuple[Job, Child]] = {}
@@ -304,18 +313,18 @@ def done(jobs: Iterable[Job], folders: list[Path], limits: dict[Tested, float]) 
 
 
 def copy(folder: Path) -> None:
-    """The working tree without what is not read, and with the folder of compiled code in common."""
+    """Copy the working tree without files that tests do not read; the folder of compiled code is shared."""
     ignored = shutil.ignore_patterns(".git", "__pycache__", "_build", ".venv", ".*_cache", ".hypothesis")
     shutil.copytree(ROOT, folder, symlinks=True, ignore=ignored)
     (ROOT / ".pytest_cache").mkdir(exist_ok=True)
     (folder / ".pytest_cache").symlink_to(ROOT / ".pytest_cache")
 
 
-# -- what is known ----------------------------------------------------------------------------------
+# -- results ----------------------------------------------------------------------------------------
 
 
 def tally(rows: list[dict[str, Any]]) -> str:
-    """How many are noticed, with the least share that 95 % allow (Clopper and Pearson)."""
+    """Text with the number of noticed mutants and its lower bound at 95 % (Clopper and Pearson)."""
     from scipy.stats import beta
 
     n, k = len(rows), sum(r["noticed"] for r in rows)
@@ -341,7 +350,7 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=1e9, help="begin no mutant after so long")
     parser.add_argument("--store", type=Path, default=STORE)
     asked = parser.parse_args()
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # children are ended then
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # this also stops the children
     begun = time.monotonic()
     found: dict[str, Any] = {"runs": [], "sources": {}, "mutants": {}}
     if asked.store.exists() and not asked.fresh:
@@ -356,12 +365,12 @@ def main() -> None:
             jobs.append(job)
     modules = list(dict.fromkeys(job.tested for job in jobs))
     if jobs:
-        # What is measured are the modules and their tests.
+        # The run measures the modules and their tests, which this script does not import.
         files = [f"rotflex_jax/{t.module}" for t in modules] + [
             f"tests/{f}" for t in modules for f in t.tests
         ]
         made = begin(found, __file__, sys.argv[1:], files=files)
-        # Loaded once for all, and not started.
+        # Imported before the fork, so that children need not import them. JAX is not started here.
         import equinox  # noqa: F401
         import hypothesis  # noqa: F401
         import jax  # noqa: F401
@@ -404,7 +413,7 @@ def main() -> None:
 
 
 def write(store: Path, found: dict[str, Any]) -> None:
-    """Beside the file and renamed, so that a stop loses nothing."""
+    """Write to a second file and rename it, so that an interruption loses nothing."""
     store.parent.mkdir(parents=True, exist_ok=True)
     beside = store.with_name(f".{store.name}")
     beside.write_text(

@@ -1,16 +1,17 @@
-"""What made a file of results: when, from which commit and versions, and which source files it measures.
+"""Origin of a file of results: date, commit, versions, and the source files on which the results depend.
 
-    python benchmarks/origin.py               # of each file: is it of the present code, and what has changed
-    python benchmarks/origin.py B3.json       # of one, each changed file
+    python benchmarks/origin.py               # for each file: whether it is from the present code
+    python benchmarks/origin.py B3.json       # for one file, with the source files that have changed
 
-A result measures the script of its benchmark and what that imports, of this folder and of the package, in
-functions too. Names that a package hands on are followed to the module that has them, so that a benchmark of
-fits does not depend on exports. Left out is what writes and shows (`SHOWN`), which changes no number. Of each
-file the meaning counts: neither comments, layout and docstrings nor the words of an error do.
+Results depend on the script of the benchmark and on all modules of this folder and of the package that it
+imports, also within functions. Re-exported names are followed to the module that declares them, so that a
+benchmark of fits does not depend on exports. Modules that only write and show (`SHOWN`) are left out, since
+they change no number. Files are compared by digests that ignore comments, layout, docstrings and the texts
+of errors.
 
-A file of results has `runs`, one entry for each time that its benchmark was started, and `sources`, the
-digests of the measured files under the name that the entries give them. What was done part by part says in
-`parts`, or in each row under `code`, which version did it; runs of which nothing is left do not count.
+A file of results has `runs`, with one entry for each start of its benchmark, and `sources`, with the digests
+of the source files under the names that the entries refer to. If a benchmark was run in parts, `parts`, or
+`code` in each row, names the version that computed them; runs without any remaining result do not count.
 """
 
 from __future__ import annotations
@@ -34,23 +35,23 @@ ROOT = HERE.parent
 RESULTS = HERE / "results"
 
 SHOWN = ("text", "report", "notebook", "cli", "errors", "checks")
-"""Parts of the package that write, show or refuse."""
+"""Parts of the package that only write, show or reject input."""
 
 DRAWN = ("page", "pages", "figure", "figures", "drawing", "origin")
-"""Last words of the names of modules that do, wherever they stand."""
+"""Last words of the names of modules that only write or show, in the package and in the benchmarks."""
 
 TABLE = "table"
-"""Last word of the names of modules of the benchmarks that do; `rotflex_jax/compare/table.py` computes."""
+"""Last word of the names of benchmark modules that only show; `rotflex_jax/compare/table.py` computes."""
 
 REGISTRIES = ("rotflex_jax.effects", "rotflex_jax.compare")
-"""Packages that count as a whole, since what is in them is found by a registry."""
+"""Packages that count as a whole, since their contents are found through a registry."""
 
 
-# -- what a file of source means ----------------------------------------------------------------------------
+# -- digest of a source file --------------------------------------------------------------------------------
 
 
 def meaning(text: str) -> str:
-    """Digest of a Python source without comments, layout, docstrings and the words of its errors.
+    """Digest of a Python source without comments, layout, docstrings and the texts of its errors.
 
     The same in every version of Python that can read the source.
 
@@ -64,7 +65,7 @@ def meaning(text: str) -> str:
 
 
 def _parts(node: Any, wordless: bool) -> Iterator[str]:
-    """Types and values of a tree, in order; without strings where an error is raised."""
+    """Types and values of a tree, in order; without the strings in `raise` statements."""
     if isinstance(node, list):
         yield "["
         for part in node:
@@ -76,7 +77,7 @@ def _parts(node: Any, wordless: bool) -> Iterator[str]:
         if wordless and isinstance(node, ast.Constant) and isinstance(node.value, str):
             return
         for name, value in ast.iter_fields(node):
-            # Fields that some versions of Python have, and others have not, are empty here.
+            # Empty fields are skipped, since some versions of Python have fields that others lack.
             if value in (None, []) or name in ("ctx", "kind", "type_comment"):
                 continue
             if isinstance(value, list):
@@ -96,7 +97,7 @@ def _is_text(statement: ast.AST) -> bool:
     )
 
 
-# -- which files a script measures --------------------------------------------------------------------------
+# -- source files on which a script depends -----------------------------------------------------------------
 
 
 class Imports:
@@ -121,7 +122,7 @@ class Imports:
         return self._read[file]
 
     def sources(self, script: str) -> dict[str, str]:
-        """Digests of the files that a script of the benchmarks measures, its own first, by path.
+        """Digests, by path, of the files on which the results of a benchmark script depend; its own is first.
 
         Args:
             script: name of the module, such as "B3_public".
@@ -131,7 +132,7 @@ class Imports:
         while waiting:
             name = waiting.pop()
             file = self.file(name)
-            # The package itself is a list of names, each of which is followed.
+            # The package itself only lists names, and each of them is followed.
             if file is None or name == "rotflex_jax" or (name != script and _shows(name)):
                 continue
             found[file.relative_to(self.root).as_posix()] = meaning(self.text(file))
@@ -211,7 +212,7 @@ class Imports:
 
 
 def _shows(name: str) -> bool:
-    """Whether a module only writes, shows or refuses, so that it changes no number."""
+    """Whether a module only writes, shows or rejects input, so that it changes no number."""
     parts = name.split(".")
     inside = parts[0] == "rotflex_jax" and len(parts) > 1
     drawn = parts[-1].split("_")[-1] in DRAWN
@@ -248,12 +249,12 @@ def _executed(node: ast.AST) -> Iterator[ast.AST]:
 
 @functools.cache
 def sources(*scripts: str) -> dict[str, str]:
-    """Present digests of the files that scripts of the benchmarks measure, by path."""
+    """Present digests, by path, of the files on which the results of benchmark scripts depend."""
     imports = Imports()
     return {path: digest for script in scripts for path, digest in imports.sources(script).items()}
 
 
-# -- what a run writes --------------------------------------------------------------------------------------
+# -- entry of a run -----------------------------------------------------------------------------------------
 
 
 def git(*command: str) -> str:
@@ -274,7 +275,7 @@ def provenance() -> dict[str, Any]:
     for file in sorted([*(HERE / "arena").glob("*.py"), *simulator.glob("*.py")]):
         arena.update(file.read_bytes())
     commit = git("rev-parse", "--short", "HEAD")
-    # Results are written while a benchmark runs, also in parts; they are not code.
+    # Results are written while a benchmark runs, and they are not code.
     changes = git("status", "--porcelain", "--", ".", ":!benchmarks/results", ":!docs/figures")
     return {
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
@@ -290,7 +291,7 @@ def provenance() -> dict[str, Any]:
 
 
 KEYS = ("runs", "sources", "parts")
-"""What stands beside the results in their file."""
+"""Keys of a file of results that are not results."""
 
 
 def begin(
@@ -301,14 +302,14 @@ def begin(
     scripts: Sequence[str] = (),
     files: Iterable[str] = (),
 ) -> dict[str, Any]:
-    """Adds a run to a file of results, with the digests of the files that the run measures.
+    """Adds a run to a file of results, with the digests of the files on which the run depends.
 
     Args:
-        results: the file, as it will be written; changed.
+        results: content of the file, changed in place.
         script: `__file__` of the benchmark.
-        arguments: with which it was started.
-        scripts: further modules that it runs, which it does not import.
-        files: further files that it measures, by path from the folder of the project.
+        arguments: arguments with which it was started.
+        scripts: further modules that it runs but does not import.
+        files: further files on which it depends, by path from the folder of the project.
 
     Returns:
         The entry without its `sources`; rows of results keep its `code`.
@@ -342,15 +343,15 @@ def without_place(arguments: Any) -> Any:
 
 
 def part(results: dict[str, Any], name: str) -> None:
-    """Records that a part of a file is from the run that was begun last."""
+    """Records that a part of a file is from the run that was started last."""
     results.setdefault("parts", {})[name] = results["runs"][-1]["code"]
 
 
-# -- what a file says ---------------------------------------------------------------------------------------
+# -- state of a file of results -----------------------------------------------------------------------------
 
 
 class Standing(NamedTuple):
-    """Whether results are from the present code; if not, the runs that they are from and what changed."""
+    """Whether results are from the present code; if not, the runs that made them and the changed files."""
 
     present: bool
     of: tuple[str, ...]
@@ -358,7 +359,7 @@ class Standing(NamedTuple):
 
 
 def runs_that_count(results: dict[str, Any]) -> list[dict[str, Any]]:
-    """Runs of which a file still has results; an entry without a commit for rows whose run is missing."""
+    """Runs that made results still in a file; for rows whose run is missing, an entry without a commit."""
     runs = list(results.get("runs") or ([results] if "commit" in results else []))
     rest = {key: value for key, value in results.items() if key not in (*KEYS, "code")}
     codes = set(results.get("parts", {}).values()) | set(_codes(rest))
@@ -381,19 +382,19 @@ def _codes(found: Any) -> Iterator[str]:
 
 
 def of_changed_tree(run: dict[str, Any]) -> bool:
-    """Whether the results may be from code that was not committed; a run that does not say counts as such."""
+    """Whether the results may be from code that was not committed, or this was not recorded."""
     return not run.get("commit") or run.get("clean", not run.get("changed", True)) is not True
 
 
 def standing(results: dict[str, Any], root: Path = ROOT) -> Standing:
-    """Whether the files that results measure are unchanged in meaning, under a folder."""
+    """Whether the source files of results, under a folder, are unchanged in meaning."""
     told, changed = list[str](), set[str]()
     present = True
     runs = runs_that_count(results)
     for run in runs:
         measured = results.get("sources", {}).get(run.get("sources"))
         other = {path for path, digest in (measured or {}).items() if _now(root / path) != digest}
-        # Older runs also recorded tables, which are left out now.
+        # Older runs also recorded tables, which no longer count.
         other -= {path for path in other if path.startswith("benchmarks/") and _is_table(Path(path).stem)}
         if measured and not other and not of_changed_tree(run):
             continue
@@ -405,13 +406,13 @@ def standing(results: dict[str, Any], root: Path = ROOT) -> Standing:
 
 @functools.cache
 def _now(file: Path) -> str:
-    """Digest of a file; empty where it is gone."""
+    """Digest of a file; empty if the file does not exist."""
     return meaning(file.read_text(encoding="utf-8")) if file.is_file() else ""
 
 
 def _words(run: dict[str, Any]) -> str:
     """Text that names a run by its commit."""
-    if run.get("stored"):  # from before results recorded their runs
+    if run.get("stored"):  # results from before runs were recorded
         return f"stored with {run['stored']}"
     if not run.get("commit"):
         return "not told"
@@ -419,10 +420,10 @@ def _words(run: dict[str, Any]) -> str:
 
 
 def remark(names: Sequence[str]) -> str:
-    """Remark on numbers from these files of results; empty if all are from the present code.
+    """Text that names results from an earlier version of the code; empty if all are from the present code.
 
     Args:
-        names: files, or folders of them.
+        names: files of results, or folders of them.
     """
     told = dict[str, list[str]]()
     for name in names:
@@ -439,7 +440,7 @@ def remark(names: Sequence[str]) -> str:
 
 
 def main() -> None:
-    """Print of each file of results whether it is from the present code."""
+    """Print for each file of results whether it is from the present code."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

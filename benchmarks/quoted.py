@@ -1,9 +1,9 @@
-"""Numbers that documents quote from the benchmarks: each stands between two marks that say where it is from.
+"""Writes the numbers that documents quote from the benchmarks, between two marks that name their source.
 
     the error falls to <!--= B3.json silverbox/rows/6/free run/multisine .2f -->0.24<!--=--> mV
     the error falls to <!--= silverbox_multisine -->0.24<!--=--> mV
 
-The first form names a file of `results/`, the way to a number in it (keys and indices), optionally a unit in
+The first form names a file of `results/`, the path of a number in it (keys and indices), optionally a unit in
 which to show the number ([deg], [mm], [ms] or [%]), and a format. The second form names a function of
 `claims.py`. Both forms may be used in README.md, docs/*.md and paper/*.md.
 
@@ -13,8 +13,8 @@ lists the results that were measured with code that has changed since (`origin.p
 its section quotes and those that the mark names (`versions B3.json B5`). It is added at the end of each
 section that needs it, unless the section already has it, and at the end of the pages in results/.
 
-    python benchmarks/quoted.py           # write what the results say into the documents
-    python benchmarks/quoted.py --check   # exit status 1 where a document says anything else
+    python benchmarks/quoted.py           # write the present results into the documents
+    python benchmarks/quoted.py --check   # write nothing; exit status 1 if a document is out of date
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ from rotflex_jax.text.files import write_file
 
 
 def at(file: str, way: str) -> Any:
-    """Value in a file of results at the end of a way, for instance "rows/-1/free run"."""
+    """Value in a file of results at a path, for instance "rows/-1/free run"."""
     here = results(file)
     for step in way.split("/"):
         here = here[int(step)] if isinstance(here, list) else here[step]
@@ -54,7 +54,7 @@ def quoted(source: str) -> str:
     """The present text for a mark.
 
     Raises:
-        LookupError: No such name, file or way.
+        LookupError: There is no such name, file or path.
     """
     if source in NAMED:
         return NAMED[source]()
@@ -81,7 +81,7 @@ def pages() -> list[Path]:
 
 
 def renewed(text: str) -> str:
-    """A text with the present results between its marks, and each section with its mark of versions."""
+    """A text with the present results between its marks, and with marks of versions where needed."""
     return "".join(_section(part) for part in sections(text))
 
 
@@ -92,7 +92,7 @@ def renewed_page(page: Path, text: str) -> str:
 
 
 def sections(text: str) -> list[str]:
-    """The parts of a text from heading to heading; lines of code are no headings."""
+    """The parts of a text from heading to heading; a `#` in a block of code starts no part."""
     code = [m.span() for m in FENCE.finditer(text)]
     starts = [m.start() for m in HEADING.finditer(text)]
     cuts = [k for k in starts if k and not any(first <= k < last for first, last in code)]
@@ -100,7 +100,7 @@ def sections(text: str) -> list[str]:
 
 
 def told_of(text: str) -> set[str]:
-    """The files of results that a text quotes, or that its marks of versions name."""
+    """Files of results that a text quotes or that its marks of versions name."""
     ASKED.clear()
     named = set[str]()
     for mark in MARK.finditer(text):
@@ -138,7 +138,7 @@ def _mark(source: str, said: str) -> str:
 
 
 def main() -> None:
-    """Write, or check with --check."""
+    """Update the documents, or only check them with --check."""
     parser = argparse.ArgumentParser(description="Write the numbers of the benchmarks into the documents.")
     parser.add_argument("--check", action="store_true", help="write nothing, compare")
     arguments = parser.parse_args()

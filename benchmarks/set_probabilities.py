@@ -1,12 +1,13 @@
-"""Calibrates the probabilities of sets of effects on tuning runs of B0, and shows how they hold.
+"""Calibrates the probabilities of sets of effects on tuning runs of B0, and tests the calibration.
 
     python benchmarks/B0_discovery.py --tuning --seeds 101 --inputs noise --seconds 10 --out plain.json
     python benchmarks/B0_discovery.py --wrong-worlds 48 --tuning --out worlds.json
     python benchmarks/set_probabilities.py plain.json worlds.json --fit --figure probabilities.png
 
-Rows of tuning runs keep what each half second says for each set (`evidence`). The rule is the one under which
-the right sets are most probable, mean logarithm over machines; it is fitted and evaluated by halves of the
-machines in turn, so that what is printed of it is of machines it was not fitted to.
+Rows of tuning runs have the evidence of each half second for each set (`evidence`). The calibrated rule
+maximises the probability of the right sets, as a mean logarithm over machines. With `--fit` it is also fitted
+to each half of the machines and evaluated on the other half, so that the reliability that is printed last and
+drawn is that on machines that were not used for the fit.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ for folder in (HERE, HERE.parent):
 from arena.probability import Row, classes, draw_probabilities, misfit, summary, told_of, usable, weighed
 from rotflex_jax.discover.probabilities import RULE, EvidenceRule
 
-# What is tried of each number; all others are held while it is.
+# Values that are tried for each constant of the rule, while the other constants keep their values.
 TRIED: dict[str, tuple[float, ...]] = {
     "temperature": (1.0, 2.0, 3.0, 5.0, 8.0, 12.0, 20.0, 50.0),
     "run_nats": (0.0, 0.1, 0.2, 0.3, 0.5, 1.0),
@@ -35,16 +36,16 @@ TRIED: dict[str, tuple[float, ...]] = {
     "passed_nats": (1.0, 2.0, 3.0, 4.0),
 }
 LEAST = 1e-3
-"""Probability of a right set below which a machine counts no more against a rule: its fit went wrong."""
+"""Lower limit of the probability of a right set in the loss, so that a failed fit does not dominate it."""
 
 
 def again(row: Row, rule: EvidenceRule) -> Row:
-    """The row with the probabilities of another rule."""
+    """The row with its probabilities recomputed with another rule."""
     return {**row, "probabilities": told_of(weighed(row, rule))}
 
 
 def loss(rows: Sequence[Row], rule: EvidenceRule) -> float:
-    """Mean of minus the log probability of the right set among those fitted, where it is among them [nat]."""
+    """Mean negative log probability of the right set, given that it is among the fitted sets [nat]."""
     within = rule._replace(elsewhere=0.0, elsewhere_unexplained=0.0)
     right = [sum(e.probability for e in classes(again(r, within)) if e.true) for r in rows]
     return -sum(math.log(max(p, LEAST)) for p in right) / max(len(rows), 1)
@@ -56,7 +57,10 @@ def has_right(row: Row) -> bool:
 
 
 def calibrated(rows: Sequence[Row], start: EvidenceRule = RULE) -> EvidenceRule:
-    """The rule under which right sets are most probable, one number at a time until none gets better."""
+    """The rule with the least loss, by a coordinate search over `TRIED`.
+
+    The probabilities of no fitted set being right are estimated from their frequencies.
+    """
     known, best = [r for r in rows if has_right(r)], start
     least = loss(known, best)
     for _ in range(4):

@@ -1,6 +1,6 @@
-"""Marks, tables and pages of the benchmarks that use the arena, `rotflex_jax.arena`.
+"""Trials, tables and pages of the benchmarks that use the arena, `rotflex_jax.arena`.
 
-The simulator, the wrong worlds, the other methods and the marks of one answer are part of the package, for
-`rotflex arena`; here is what only the benchmarks need: trials of the search beside its oracle, their tables,
-calibration, the demonstration recording.
+The package contains what `rotflex arena` needs: the simulator, wrong worlds, other methods, and the scoring
+of one answer. This folder contains what only the benchmarks need: trials of the search and its oracle,
+their tables and pages, calibration of probabilities, and the demonstration recording.
 """

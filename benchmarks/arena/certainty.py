@@ -1,6 +1,7 @@
-"""How often intervals hold the true number and bands the measured samples, on one record of the arena.
+"""Rows of B11: whether intervals contain the true values, and how many samples lie inside prediction bands.
 
-Imports JAX, so workers import it.
+Each row is of one simulated machine. The module imports JAX, so it must be imported after the settings of a
+process are made.
 """
 
 from __future__ import annotations
@@ -26,12 +27,16 @@ from rotflex_jax.text.numbers import json_number
 
 FS = 500.0
 SUBSTEPS = 3
-"""Steps in each sample: friction stops and starts within one, which would bias its level by an interval."""
+"""Integration steps for each sample.
+
+Sticking may start and end within a sample. One step for each sample would bias the level of a friction by
+about the width of its interval.
+"""
 LEVEL = 0.9
 
 
 def true_model(places: list[Place], size: float = 1.0) -> Model:
-    """The true structure with half the true sizes, where a fit starts."""
+    """The true structure with half the true sizes of the hidden effects, at which a fit starts."""
     m = textbook()
     for place in places:
         kept = SHAPES.get(place[0], set())
@@ -41,14 +46,14 @@ def true_model(places: list[Place], size: float = 1.0) -> Model:
 
 
 def record(job: dict[str, Any], kind: str, seconds: float) -> tuple[rf.Recording, dict[str, Any]]:
-    """A recording of the machine of a job under an input, and its truth."""
+    """A recording of the machine of a job under a kind of input, and its truth."""
     places = [tuple(p) for p in job["effects"]]
     r = make_record(places, kind=kind, seed=job["seed"], size=job["size"], seconds=seconds, fs=FS)
     return rf.Recording(u=r["u"], y=r["y"], Ts=r["Ts"], source="arena"), r["truth"]
 
 
 def intervals(job: dict[str, Any]) -> dict[str, Any]:
-    """Profile and Wald intervals of the parameters of the hidden effect, beside the truth."""
+    """Profile and Wald intervals of the parameters of the hidden effect; whether they contain the truth."""
     row: dict[str, Any] = dict(job)
     try:
         rec, truth = record(job, job["kind"], job["seconds"])
@@ -84,17 +89,17 @@ def intervals(job: dict[str, Any]) -> dict[str, Any]:
                     "s": time.perf_counter() - began,
                 }
             )
-    except Exception as problem:  # the benchmark reports it and goes on
+    except Exception as problem:  # recorded as a row with its error
         row["error"] = f"{type(problem).__name__}: {problem}"
         row["traceback"] = traceback.format_exc()
     return row
 
 
 def bands(job: dict[str, Any]) -> dict[str, Any]:
-    """Coverage of bands over a run that nobody fitted, of the true structure and of the textbook's.
+    """Coverage of bands over held-out data, for the true structure and for the textbook model.
 
-    The same machine runs three times: the first run is fitted, the second is known to the band of the
-    textbook's model, the third is held out.
+    A recording is cut into three parts of equal length. The first is fitted, the third is held out. Each
+    model has two bands: one from its fit alone, and one that also uses its errors over the second part.
     """
     row: dict[str, Any] = dict(job)
     try:
@@ -121,7 +126,7 @@ def bands(job: dict[str, Any]) -> dict[str, Any]:
 
 
 def cost(job: dict[str, Any]) -> dict[str, Any]:
-    """Processor seconds of all that says how sure a fit is, compiling included, on one recording."""
+    """Processor time [s] of profiles, identifiability, bands and probabilities, with compilation."""
     row: dict[str, Any] = dict(job)
     try:
         (place,) = (tuple(p) for p in job["effects"])
@@ -150,13 +155,13 @@ COST_SECONDS = 20.0
 
 
 def twenty_sets(seconds: float) -> list[FittedSet]:
-    """Evidence of as many sets as a long search fits, half second by half second."""
+    """Random evidence, by half seconds, of twenty sets of effects, about as many as a long search fits."""
     rng, blocks = np.random.default_rng(0), round(2 * seconds)
     return [FittedSet(frozenset({f"e{k}@hub"}), *rng.normal(size=(2, blocks))) for k in range(20)]
 
 
 def trial(job: dict[str, Any]) -> dict[str, Any]:
-    """One row of any part."""
+    """One row of the part that the job names."""
     return {"intervals": intervals, "bands": bands, "cost": cost}[job["part"]](job)
 
 

@@ -1,4 +1,4 @@
-"""Makes the demonstration recording of the package: two effects that the textbook joint lacks.
+"""Makes the demonstration recording of the package, with two effects that the textbook joint lacks.
 
 Run ``python -m arena.demo_record`` with `benchmarks` on the path to write `demo.csv` and
 `demo_truth.json` into `rotflex_jax/data`.
@@ -32,10 +32,10 @@ def write(folder: Path = FOLDER) -> tuple[Path, Path]:
     """Write recording and truth.
 
     Args:
-        folder: where to; created if missing.
+        folder: folder of the files; created if missing.
 
     Returns:
-        Paths of the table and of the truth.
+        Paths of the recording and of the truth.
     """
     record = demo()
     folder.mkdir(parents=True, exist_ok=True)

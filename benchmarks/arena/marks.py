@@ -1,4 +1,4 @@
-"""What a set of records says of the search: groups, confusion of names, promises kept."""
+"""Statistics over the rows of B0: groups, confusion of effects, and coverage of intervals and sets."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from rotflex_jax.arena.simulator.hidden import DEFAULTS, OUTSIDE
 
 Row = dict[str, Any]
 
-# What intervals may claim; the standard deviation of an estimate stands for all of them.
+# Probabilities of the intervals that are checked; all follow from the standard deviation of an estimate.
 CLAIMS = (0.5, 0.68, 0.8, 0.9, 0.95, 0.99)
 
 
 class Kept(NamedTuple):
-    """A promise and how often it was kept.
+    """A stated probability, and how often the statement was true.
 
     Attributes:
-        claim: share of cases in which it should hold.
-        held: cases in which it did.
-        cases: all cases.
+        claim: share of cases in which the statement should be true.
+        held: number of cases in which it was true.
+        cases: number of all cases.
     """
 
     claim: float
@@ -32,22 +32,22 @@ class Kept(NamedTuple):
 
     @property
     def share(self) -> float:
-        """Share of cases in which it held."""
+        """Share of cases in which the statement was true."""
         return self.held / self.cases if self.cases else math.nan
 
     @property
     def scatter(self) -> float:
-        """Deviation of that share if the promise is true."""
+        """Standard deviation of the share if the stated probability is right."""
         return math.sqrt(self.claim * (1 - self.claim) / self.cases) if self.cases else math.nan
 
 
 def good(records: list[Row]) -> list[Row]:
-    """Records that ran."""
+    """Rows without an error."""
     return [r for r in records if "error" not in r]
 
 
 def group(row: Row) -> str:
-    """Which part of the benchmark a record belongs to."""
+    """Name of the group of a row: number of hidden effects, their size if not 1, and a single sensor."""
     count = ["nothing hidden", "one effect", "two effects", "three effects"][len(row["effects"])]
     if row.get("outside"):
         count = "effect without a name"
@@ -58,7 +58,7 @@ def group(row: Row) -> str:
 
 
 def grouped(records: list[Row]) -> dict[str, list[Row]]:
-    """Records by group, in the order they are met."""
+    """Rows without an error by group, in the order of their first row."""
     found: dict[str, list[Row]] = {}
     for row in good(records):
         found.setdefault(group(row), []).append(row)
@@ -66,10 +66,12 @@ def grouped(records: list[Row]) -> dict[str, list[Row]]:
 
 
 def confusion(records: list[Row]) -> tuple[list[str], list[str], Counter[tuple[str, str]]]:
-    """Hidden effect against the first effect found, of records with at most one of usual size.
+    """Hidden effect against the first effect found.
+
+    Only rows with both sensors and at most one hidden effect, of the usual size, count.
 
     Returns:
-        Hidden names, names answered, and how often each met the other.
+        Names of hidden effects, names in answers, and the number of rows for each pair.
     """
     single = [r for r in good(records) if len(r["effects"]) < 2 and r.get("size", 1.0) == 1.0]
     single = [r for r in single if len(r.get("channels", ["theta", "alpha"])) == 2]
@@ -84,7 +86,7 @@ def confusion(records: list[Row]) -> tuple[list[str], list[str], Counter[tuple[s
 
 
 def intervals(records: list[Row]) -> list[Kept]:
-    """How often intervals of each claim hold the truth, over all parameters of effects found."""
+    """How often intervals of each probability contain the true value, over parameters of effects found."""
     numbers = [
         abs(p["estimate"] - p["true"]) / p["std"]
         for r in good(records)
@@ -95,12 +97,12 @@ def intervals(records: list[Row]) -> list[Kept]:
 
 
 def sets(records: list[Row]) -> Kept:
-    """How often the reported sets hold every hidden effect; of records in which something was found."""
+    """How often all hidden effects are found or listed as equivalent, over rows with an effect found."""
     told = [r for r in good(records) if r["wanted"] and r["rounds"] and not r.get("outside")]
     return Kept(0.95, sum(bool(r["inside"]) for r in told), len(told))
 
 
 def mean_set(records: list[Row]) -> float:
-    """Mean size of the largest set of a record; 1 where every answer stands alone."""
+    """Mean over rows of the size of the largest set of equivalent effects; 1 if no effect has equivalents."""
     told = [r["set_size"] for r in good(records) if r["rounds"] and "set_size" in r]
     return sum(told) / len(told) if told else math.nan

@@ -1,4 +1,4 @@
-"""Tables and figures of B0 for a reader: Markdown and two pictures beside the results file."""
+"""The page of B0 in Markdown and its two figures, written beside the results file."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from rotflex_jax.text.plotting import blank, styled
 
 
 def publish(records: list[Row], results: Path) -> list[Path]:
-    """Write `B0.md` beside `B0.json`, and those of its two figures that have anything to show.
+    """Writes the page and, if there are data for them, the two figures beside the results file.
 
     Args:
         records: all rows of the results file.
-        results: that file.
+        results: path of that file.
 
     Returns:
-        Files written.
+        Paths of the written files.
     """
     if not good(records):
         return []
@@ -38,7 +38,7 @@ def publish(records: list[Row], results: Path) -> list[Path]:
 
 
 def written(records: list[Row], figures: list[Path]) -> str:
-    """The page."""
+    """The page in Markdown."""
     lines = ["# B0: hidden effects, found and missed", ""]
     lines += [
         "| hidden | records | first right | all right, no more | truth in the set | verdict right | "
@@ -74,7 +74,7 @@ def written(records: list[Row], figures: list[Path]) -> str:
 
 
 def by_seed(records: list[Row]) -> list[str]:
-    """One effect of the usual size, effects without a name, and nothing hidden, for each seed."""
+    """Table by seed: one effect of the usual size, effects that the catalogue lacks, nothing hidden."""
     lines = [
         "| seed | one effect, first right | without a name, unexplained | nothing hidden, alarms |",
         "|---|---|---|---|",
@@ -98,7 +98,7 @@ def by_seed(records: list[Row]) -> list[str]:
 
 @styled
 def draw_confusion(records: list[Row], path: Path) -> None:
-    """Hidden effects against first answers; the share of each row in shades of one colour."""
+    """Draws a matrix of hidden effects against first effects found, shaded by the share of each row."""
     truths, answers, pairs = confusion(records)
     share = np.array([[pairs[t, a] for a in answers] for t in truths], float)
     total = share.sum(axis=1, keepdims=True)
@@ -136,7 +136,7 @@ def _frame(j: int, i: int):
 
 @styled
 def draw_reliability(records: list[Row], path: Path) -> None:
-    """What intervals and sets claim against how often they hold the truth."""
+    """Draws the share of intervals and sets that contain the truth against their stated probability."""
     kept = [k for k in intervals(records) if k.cases]
     figure = blank(5.0, 4.6)
     ax = figure.subplots()

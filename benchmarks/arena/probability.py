@@ -1,4 +1,4 @@
-"""Are the probabilities of sets of effects what they say: rows of evidence, reliability, credible sets."""
+"""Calibration of the probabilities of sets of effects: stored evidence, reliability, credible sets."""
 
 from __future__ import annotations
 
@@ -19,22 +19,22 @@ from rotflex_jax.arena.simulator.laws import Place
 from rotflex_jax.text.colours import BASELINE, FINAL, INK
 from rotflex_jax.text.plotting import blank, styled
 
-if TYPE_CHECKING:  # a process makes its settings ahead of JAX
+if TYPE_CHECKING:  # a process makes its settings before it imports JAX
     from rotflex_jax.discover import Discovery
     from rotflex_jax.discover.probabilities import EvidenceRule, Probabilities
 
 Row = dict[str, Any]
 
 CREDIBLE = 0.9
-"""Mass of a credible set."""
+"""Probability of a credible set."""
 
 
 def told(result: Discovery, evidence: bool = False) -> Row:
-    """What a row keeps of the probabilities of a search.
+    """The entries of a row for the probabilities of a search.
 
     Args:
-        result: The search.
-        evidence: Whether the half seconds are kept too, for a calibration.
+        result: Result of the search.
+        evidence: Whether the evidence of each half second is stored too, for a calibration.
     """
     found = result.probabilities
     if found is None:
@@ -56,7 +56,7 @@ def told_of(found: Probabilities) -> Row:
 
 
 def _written(blocks: NDArray[np.float64] | None, digits: int) -> str | None:
-    """Blocks as a line of text."""
+    """Values of the blocks as a line of text."""
     return None if blocks is None else " ".join(f"{x:.{digits}f}" for x in blocks)
 
 
@@ -66,7 +66,7 @@ def _read(line: str | None) -> NDArray[np.float64] | None:
 
 
 def weighed(row: Row, rule: EvidenceRule) -> Probabilities:
-    """The probabilities of a row with another rule, from its evidence."""
+    """The probabilities of a row under another rule, from its stored evidence."""
     from rotflex_jax.discover.probabilities import FittedSet, probabilities
 
     sets = [FittedSet(frozenset(names), _read(p), _read(f)) for names, p, f in row["evidence"]]
@@ -74,7 +74,7 @@ def weighed(row: Row, rule: EvidenceRule) -> Probabilities:
 
 
 def misfit(row: Row) -> float:
-    """What the model of a row leaves, as its verdict measured it; by its short runs alone in older rows."""
+    """Misfit of the final model of a row; in rows without it, computed from short free runs alone."""
     from rotflex_jax.discover.verdict import Assessment
 
     if "misfit" in row:
@@ -90,10 +90,10 @@ def place_of(name: str) -> Place:
 
 
 def reduced(names: Iterable[str], row: Row) -> frozenset[Place] | None:
-    """A set less what is right besides the hidden effects; None where it is right.
+    """A set of effects without further errors of a wrong world; None for a right set.
 
-    In a wrong world, names of what is wrong besides neither add to nor take from an answer, so that sets that
-    differ by them alone are one.
+    Names of further errors make an answer neither better nor worse, so that sets that differ only by such
+    names count as the same answer.
     """
     places = frozenset(place_of(n) for n in names)
     if "world" not in row:
@@ -106,7 +106,7 @@ def reduced(names: Iterable[str], row: Row) -> frozenset[Place] | None:
 
 
 def classes(row: Row) -> list[Event]:
-    """The sets of a row, those that are one answer together, most probable first."""
+    """Probabilities of the answers of a row, most probable first; sets with the same answer are added up."""
     mass: dict[frozenset[Place] | None, float] = {}
     for names, p in row["probabilities"]["sets"]:
         key = reduced(names, row)
@@ -115,7 +115,7 @@ def classes(row: Row) -> list[Event]:
 
 
 def effect_events(row: Row) -> list[Event]:
-    """The effects of a row: is each there, or what no recording tells from it?"""
+    """Probability of each effect of a row, and whether it or an equivalent effect is present."""
     if "world" in row:
         there = {(e, p) for b in row["besides"] for e, p in b["names"]}
         there |= set() if row["hidden"] is None else alike((row["hidden"][0], row["hidden"][1]))
@@ -129,16 +129,16 @@ def effect_events(row: Row) -> list[Event]:
 
 
 def usable(records: Iterable[Row]) -> list[Row]:
-    """Rows with probabilities, of machines for whose effects the catalogue has names."""
+    """Rows with probabilities, without those whose effect the catalogue lacks."""
     return [r for r in good(list(records)) if "probabilities" in r and not r.get("outside")]
 
 
 def scatter_of_right(machines: Sequence[Sequence[float]], draws: int = 300) -> tuple[float, float]:
-    """Calibration error that so few machines would show if every probability were right: mean, 95 % below.
+    """Calibration error by chance if all probabilities are right: its mean and its 95 % quantile.
 
     Args:
-        machines: Of each the probabilities of answers that exclude each other.
-        draws: How often the truth of all machines is drawn from these.
+        machines: Probabilities of mutually exclusive answers, for each machine.
+        draws: How often the truth of all machines is drawn from these probabilities.
     """
     rng, found = np.random.default_rng(0), []
     for _ in range(draws):
@@ -151,7 +151,7 @@ def scatter_of_right(machines: Sequence[Sequence[float]], draws: int = 300) -> t
 
 
 class CredibleSets(NamedTuple):
-    """How often credible sets hold the truth, and how many sets that takes."""
+    """Share of credible sets that contain the truth, their mean number of answers, and the number of rows."""
 
     held: float
     size: float
@@ -159,7 +159,7 @@ class CredibleSets(NamedTuple):
 
 
 def credible(rows: Sequence[Row]) -> CredibleSets:
-    """The fewest sets of `CREDIBLE` of what was fitted, over rows, one at least; one answer counts once."""
+    """Credible sets of rows: fewest answers with the share `CREDIBLE` of the probability of fitted sets."""
     held, sizes = [], []
     for row in rows:
         listed = classes(row)
@@ -171,7 +171,7 @@ def credible(rows: Sequence[Row]) -> CredibleSets:
 
 
 def summary(records: Iterable[Row]) -> str:
-    """Calibration of a results file, in lines."""
+    """Calibration of the rows of a results file, in lines of text."""
     lines, every = [], usable(records)
     kinds = {
         "plain": [r for r in every if "world" not in r],
@@ -201,7 +201,7 @@ def summary(records: Iterable[Row]) -> str:
 
 @styled
 def draw_probabilities(records: list[Row], path: Path) -> None:
-    """Reliability diagram of the probabilities of sets and of effects."""
+    """Draws the reliability diagram of the probabilities of sets and of effects."""
     rows = usable(records)
     figure = blank(5.4, 4.8)
     ax = figure.subplots()
@@ -233,7 +233,7 @@ def draw_probabilities(records: list[Row], path: Path) -> None:
 
 
 def drawn_probabilities(records: list[Row], results: Path) -> list[Path]:
-    """The diagram beside a results file, as `B0_probabilities.png`; none without probabilities."""
+    """Draws the diagram to a file such as `B0_probabilities.png`, if any rows have probabilities."""
     if not usable(records):
         return []
     path = results.with_name(f"{results.stem}_probabilities.png")

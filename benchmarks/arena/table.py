@@ -1,4 +1,4 @@
-"""What B0 shows: a table of all records, sums, and the misses."""
+"""Tables of B0 in the terminal: all recordings, counts, and wrong answers."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from rich.table import Table
 
 
 def label(job: dict[str, Any]) -> str:
-    """What is hidden, and how the record differs from the usual one, in short."""
+    """Hidden effects of a recording, and its size and sensor if they are not the usual ones."""
     name = " + ".join(f"{e}@{p}" for e, p in job["effects"]) or "nothing"
     size, channels = job.get("size", 1.0), job.get("channels", ["theta", "alpha"])
     name += f" x{size:g}" if size != 1 else ""
@@ -18,12 +18,12 @@ def label(job: dict[str, Any]) -> str:
 
 
 def mark(ok: bool | None) -> str:
-    """A tick or a cross."""
+    """A coloured "yes" or "no", or "-" for None."""
     return "-" if ok is None else "[green]yes[/]" if ok else "[red]no[/]"
 
 
 def answer(row: dict[str, Any]) -> str:
-    """What was found, look-alikes of each in brackets."""
+    """Effects that were found, each with its equivalent effects in brackets."""
     parts = []
     for r in row["rounds"]:
         others = ", ".join("@".join(p) for p in r["equivalent"])
@@ -38,7 +38,7 @@ def worst(row: dict[str, Any]) -> str:
 
 
 def show(console: Console, records: list[dict[str, Any]]) -> None:
-    """Table of all records, then sums, then the misses."""
+    """Prints a table of all recordings, counts, and wrong answers."""
     table = Table(title="B0: one hidden effect", header_style="bold")
     columns = "hidden,input,seed,answer,first,exact,in set,verdict,right,error %,vs oracle,wall s,cpu s"
     for name in columns.split(","):
@@ -64,7 +64,7 @@ def show(console: Console, records: list[dict[str, Any]]) -> None:
 
 
 def summary(records: list[dict[str, Any]]) -> str:
-    """The figures by which releases are compared."""
+    """Counts and medians by which versions of the search are compared."""
     good = [r for r in records if "error" not in r]
     outside = [r for r in good if r.get("outside")]
     seen = [r for r in good if r["wanted"] and not r.get("outside")]

@@ -1,4 +1,8 @@
-"""One benchmark record from the arena: search, oracle, marks. Imports JAX, so workers import it."""
+"""Rows of B0: one simulated recording, the search, its score, and the oracle.
+
+The oracle is the true structure, fitted to the same data. The module imports JAX, so it must be imported
+after the settings of a process are made.
+"""
 
 from __future__ import annotations
 
@@ -35,20 +39,20 @@ def recording(job: dict[str, Any]) -> tuple[rf.Recording, dict[str, Any]]:
 
 
 def textbook(channels: Sequence[str] = BOTH) -> rf.Mechanism:
-    """The joint without any hidden effect, with the sensors that there are."""
+    """The joint without hidden effects, with the given sensors."""
     joint = rf.joints.paper()
     return dataclasses.replace(joint, outputs=tuple(o for o in joint.outputs if o[0] in channels))
 
 
 def windows_error(model: Model, test: rf.Recording) -> dict[str, float]:
-    """Root mean square error of short free runs per channel, what a run may see not counted."""
+    """Root mean square error of short free runs by channel, without the samples at the start of each."""
     run = model.simulate_windows(test, WINDOW)
     rms = windowed_rmse([test], [model.measured(test)], [run], WINDOW)
     return dict(zip(model.mechanism.channels, rms.tolist(), strict=True))
 
 
 def oracle(places: list[Place], train: rf.Recording, test: rf.Recording) -> dict[str, Any]:
-    """The true structure, fitted from half the default sizes and never told the true numbers."""
+    """Errors of the true structure on validation data; its fit starts from half the default sizes."""
     m = textbook(list(train.channels))
     for place in places:
         if place in ABSORBED or (place[1] in BOTH and place[1] not in m.channels):
@@ -61,7 +65,7 @@ def oracle(places: list[Place], train: rf.Recording, test: rf.Recording) -> dict
 
 
 def with_oracle(row: dict[str, Any], train: rf.Recording, test: rf.Recording) -> dict[str, Any]:
-    """The row with the oracle beside it, where the truth has a name."""
+    """The row with its oracle, or without one if the catalogue lacks the hidden effect."""
     if row["outside"]:
         return row
     best = oracle([(e, p) for e, p in row["effects"]], train, test)
@@ -73,20 +77,20 @@ def with_oracle(row: dict[str, Any], train: rf.Recording, test: rf.Recording) ->
 
 
 def evaluated_again(row: dict[str, Any]) -> dict[str, Any]:
-    """A row with its oracle computed again, the search left as it was; the row itself where that fails."""
+    """The row with a new oracle and unchanged results of the search; or with the error of the oracle."""
     try:
         return with_oracle(row, *recording(row)[0].split(SPLIT))
-    except Exception as problem:  # a finished search is worth more than its oracle
+    except Exception as problem:  # the results of the search are kept
         return {**row, "oracle_error": f"{type(problem).__name__}: {problem}"}
 
 
 def trial(job: dict[str, Any], tell: Callable[[str], None] = lambda _: None) -> dict[str, Any]:
-    """Searches one record and marks the answer; a failure is a row with its error.
+    """Simulates one recording, searches it and scores the answer; a failure gives a row with its error.
 
     Args:
-        job: `effects`, `kind`, `seed`, `seconds`; `size` if not 1, `channels` if not both;
-            `keep_evidence` to keep what the probabilities of sets rest on.
-        tell: called with lines of progress.
+        job: `effects`, `kind`, `seed`, `seconds`; `size` if not 1, `channels` if not both; `keep_evidence` to
+            store the evidence from which the probabilities of sets follow.
+        tell: function that is called with lines of progress.
 
     Returns:
         A row for JSON.
@@ -136,7 +140,7 @@ def trial(job: dict[str, Any], tell: Callable[[str], None] = lambda _: None) -> 
             **told(result, job.get("keep_evidence", False)),
         )
         row = with_oracle(row, train, test)
-    except Exception as problem:  # the benchmark reports it and goes on
+    except Exception as problem:  # recorded as a row with its error
         row["error"] = f"{type(problem).__name__}: {problem}"
         row["traceback"] = traceback.format_exc()
     row["lines"] = lines

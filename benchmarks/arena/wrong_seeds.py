@@ -1,3 +1,3 @@
-"""Numbers of the wrong worlds to tune on and to report; a world of one set is never in the other."""
+"""Seeds of the wrong worlds for tuning and for reports; no world belongs to both sets."""
 
 TUNING, REPORT = tuple(range(204, 404)), tuple(range(3000, 3200))

@@ -1,4 +1,4 @@
-"""What B0 shows of the wrong worlds: a table, sums, and a page beside the results file."""
+"""Tables of the wrong worlds of B0 in the terminal, and their page beside the results file."""
 
 from __future__ import annotations
 
@@ -19,29 +19,32 @@ Row = dict[str, Any]
 from rotflex_jax.text.files import write_file
 
 SEEN = tuple(range(3000, 3070))
-"""Report worlds that were read before an earlier revision; what is quoted is of the others."""
+"""Worlds of the report set whose results were read before a revision of the search.
+
+Quoted figures are of the other worlds.
+"""
 
 
 def fresh(records: Iterable[Row]) -> list[Row]:
-    """Worlds that no revision had seen when they were run."""
+    """Worlds whose results were not read before any revision of the search."""
     return [r for r in records if r["world"] not in SEEN]
 
 
 def hidden_in(row: Row) -> str:
-    """What a world hides, in short."""
+    """Hidden effect and kind of a world."""
     if "kind" not in row:
         return f"world {row['world']}"
     return f"{'@'.join(row['hidden']) if row['hidden'] else 'nothing'} ({row['kind']})"
 
 
 def besides_in(row: Row) -> str:
-    """What else is wrong there, less what every world has."""
+    """Further errors of a world, without those that every world has."""
     always = {"trusted_constants", "voltage_offset"}
     return ", ".join(b["name"] for b in row["besides"] if b["name"] not in always) or "-"
 
 
 def said(row: Row) -> str:
-    """The answer, provisional rounds in brackets."""
+    """Effects that were found, provisional ones in brackets."""
     each = [(answer({"rounds": [r]}), r["status"]) for r in row["rounds"]]
     return ", ".join(text if status == "established" else f"({text})" for text, status in each) or "nothing"
 
@@ -54,7 +57,7 @@ def degrees(row: Row, recording: str, kind: str) -> str:
 
 
 def show_worlds(console: Console, records: list[Row]) -> None:
-    """Table of all worlds, then sums."""
+    """Prints a table of all worlds, and counts."""
     table = Table(title="B0: wrong worlds", header_style="bold")
     columns = "world,hidden,besides,answer,named,first,wrong,verdict,test windows deg,wall s,cpu s"
     for name in columns.split(","):
@@ -76,7 +79,7 @@ def show_worlds(console: Console, records: list[Row]) -> None:
 
 
 def summary(records: list[Row]) -> str:
-    """The figures by which releases are compared."""
+    """Counts and medians by which versions of the search are compared."""
     lines = []
     for name, rows in groups(records).items():
         hidden = [r for r in rows if r["hidden"]]
@@ -99,7 +102,7 @@ def summary(records: list[Row]) -> str:
 
 
 def groups(records: list[Row]) -> dict[str, list[Row]]:
-    """Worlds that ran, by kind, those that hide nothing apart, and all."""
+    """Worlds without an error: by kind, those with nothing hidden, and all."""
     rows = good(records)
     named = [r for r in rows if r["hidden"]]
     found = {
@@ -112,13 +115,13 @@ def groups(records: list[Row]) -> dict[str, list[Row]]:
 
 
 def count(rows: list[Row], key: str) -> str:
-    """Wrong effects, and the worlds that they are in."""
+    """Number of wrong effects, and number of worlds with any."""
     found = [len(r[key]) for r in rows]
     return f"{sum(found)} in {sum(n > 0 for n in found)}/{len(rows)} worlds"
 
 
 def ratios(rows: list[Row], recording: str = "test", kind: str = "windows_calibrated") -> str:
-    """Median of final over baseline error, theta / alpha."""
+    """Median of the final error over the baseline error, for theta and alpha."""
     parts = []
     for channel in ("theta", "alpha"):
         pairs = [
@@ -134,14 +137,14 @@ def ratios(rows: list[Row], recording: str = "test", kind: str = "windows_calibr
 
 
 def publish_worlds(records: list[Row], results: Path) -> list[Path]:
-    """Write the page beside the results file.
+    """Writes the page beside the results file.
 
     Args:
-        records: all rows of that file.
-        results: the file.
+        records: all rows of the results file.
+        results: path of that file.
 
     Returns:
-        Files written.
+        Paths of the written files.
     """
     if not good(records):
         return []
@@ -151,7 +154,7 @@ def publish_worlds(records: list[Row], results: Path) -> list[Path]:
 
 
 def _sums(records: list[Row]) -> list[str]:
-    """Sums of each kind of world, as a table."""
+    """Table of counts and error ratios for each kind of world."""
     lines = [
         "| worlds | count | named | of it established | named first | wrong, established | wrong, "
         "provisional | test windows, after / before | test whole |",
@@ -168,7 +171,7 @@ def _sums(records: list[Row]) -> list[str]:
 
 
 def written(records: list[Row]) -> str:
-    """The page."""
+    """The page in Markdown."""
     lines = [
         "# B0: wrong worlds",
         "",

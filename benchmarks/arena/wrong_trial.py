@@ -1,4 +1,7 @@
-"""One wrong world of the benchmark: search, marks. Imports JAX, so workers import it."""
+"""Rows of B0 for wrong worlds: one simulated machine, the search, and its score.
+
+The module imports JAX, so it must be imported after the settings of a process are made.
+"""
 
 from __future__ import annotations
 
@@ -19,21 +22,22 @@ from rotflex_jax.text.numbers import json_number
 def marks(
     hidden: Place | None, besides: Iterable[Sequence[Place]], rounds: Sequence[dict[str, Any]]
 ) -> dict[str, Any]:
-    """How an answer compares with a world.
+    """Compares an answer with the truth of a world.
 
     Args:
-        hidden: what should be named.
-        besides: right names of each thing that is wrong besides.
-        rounds: answers with `effect`, `port`, `equivalent` and `status`.
+        hidden: effect that should be named, or None.
+        besides: right names of each further error of the world.
+        rounds: effects that were found, with `effect`, `port`, `equivalent` and `status`.
 
     Returns:
-        `named`: the hidden effect, or what no recording tells from it, is found or listed as equivalent to
-        what is found, None where nothing is hidden; `named_established`: the same among established
-        rounds; `first`: it is the first round that is no right name of something besides; `wrong`: rounds
-        that neither name it, alone or by an equivalent, nor anything besides, by status.
+        `named`: whether the hidden effect, or one that no recording distinguishes from it, is found or listed
+        as equivalent to a found effect; `named_established`: the same among established effects; `first`:
+        whether it is the first found effect that is no further error of the world; `wrong_established` and
+        `wrong_provisional`: found effects that are neither the hidden effect nor a further error, also not by
+        an equivalent. The first three are None if nothing is hidden.
     """
     wanted = set() if hidden is None else alike(hidden)
-    # A part of an asymmetric law is not wrong, but an equivalent of nothing is.
+    # Names of further errors are neither required nor wrong.
     forgiven = {p for names in besides for p in names}
     wrong: dict[str, list[list[str]]] = {ESTABLISHED: [], PROVISIONAL: []}
     hits, first = [], None
@@ -43,7 +47,7 @@ def marks(
         hits += [r["status"]] * hit
         if not hit and not said & forgiven:
             wrong[r["status"]].append([r["effect"], r["port"]])
-        # What is besides may come first: it is true.
+        # A further error may be found first, since it is true.
         if first is None and (hit or not said & forgiven):
             first = hit
     return {
@@ -56,7 +60,7 @@ def marks(
 
 
 def told(w: World) -> dict[str, Any]:
-    """A world as a row of the results begins."""
+    """The entries of a row for the world itself."""
     return {
         "world": w.seed,
         "kind": w.kind,
@@ -71,11 +75,12 @@ def told(w: World) -> dict[str, Any]:
 
 
 def trial(job: dict[str, Any], tell: Callable[[str], None] = lambda _: None) -> dict[str, Any]:
-    """Searches one world and marks the answer; a failure is a row with its error.
+    """Simulates one world, searches it and scores the answer; a failure gives a row with its error.
 
     Args:
-        job: `world`, its number; `keep_evidence` to keep what the probabilities of sets rest on.
-        tell: called with lines of progress.
+        job: `world`, its seed; `keep_evidence` to store the evidence from which the probabilities of sets
+            follow.
+        tell: function that is called with lines of progress.
 
     Returns:
         A row for JSON.
@@ -112,7 +117,7 @@ def trial(job: dict[str, Any], tell: Callable[[str], None] = lambda _: None) -> 
                 for name, recording in (("validation", w.validation), ("test", w.test))
             },
         )
-    except Exception as problem:  # the benchmark reports it and goes on
+    except Exception as problem:  # recorded as a row with its error
         row["error"] = f"{type(problem).__name__}: {problem}"
         row["traceback"] = traceback.format_exc()
     row["lines"] = lines

@@ -1,1 +1,1 @@
-"""What `B1_rotflex.py` needs beside its tables: structures with names, and figures."""
+"""Parts of `B1_rotflex.py` beside its tables: integrators, fits and figures."""

@@ -1,10 +1,10 @@
-"""The joint by itself: the arm behind the measured hub, so that no error of the hub gets in.
+"""Laws of the joint, fitted to the arm alone: the measured hub angle is the input of the model.
 
     phi'' = -(w2 alpha + d alpha' + cubic alpha^3 + level z + dry s),   alpha = phi - theta measured
 
-with `z` of Bouc and Wen (width, beta) and `s` a dry friction that builds up over a thousandth of a
-degree. The angle of the hub is smoothed a little, more where it hardly moves, since each count of its
-sensor would set the arm ringing.
+Here `z` is the state of Bouc-Wen hysteresis (width, beta) and `s` the smoothed sign tanh(alpha' / 0.01
+rad/s) of dry friction. The measured angle of the hub is smoothed slightly, and more where it hardly moves,
+because each count of its sensor would excite an oscillation of the arm.
 """
 
 import functools
@@ -18,7 +18,7 @@ from scipy.signal import savgol_filter
 import rotflex_jax as rf
 from rotflex_jax.runtime.xla import double_precision
 
-# Start and scale of each number; w2 and cubic per unit of the arm's inertia.
+# Start and scale of each parameter; torques are divided by the inertia of the arm.
 START = {
     "w2": 520.0,
     "d": 0.3,
@@ -50,12 +50,12 @@ STEPS = 3  # per sample
 
 
 def compare(runs: dict[str, rf.Recording]) -> dict:
-    """Errors of the deflection [deg] of each law, learnt from one run and evaluated on each."""
+    """Errors of the deflection [deg] of each law, fitted to one run and evaluated on each run."""
     out = {}
     for law, free in LAWS.items():
         for learnt, run in runs.items():
             numbers = _fitted(run, free)
-            # A bias belongs to its recording.
+            # A bias is a calibration of one recording.
             errors = {
                 k: float(np.sqrt(np.mean(_errors(numbers | ({} if k == learnt else {"bias": 0.0}), r) ** 2)))
                 for k, r in runs.items()

@@ -10,7 +10,7 @@ from measured_joint.fine_run import STRUCTURES, TAKEN, free_runs
 from rotflex_jax.text.colours import BASELINE, FINAL, FURTHER, INK, MEASURED
 from rotflex_jax.text.plotting import blank, legend_above, plain_ticks, styled
 
-# The sensor: steps of 360 / 4096 degrees, as a standard deviation.
+# Standard deviation of the rounding to sensor steps of 360 / 4096 degrees.
 NOISE = 360 / 4096 / np.sqrt(12)
 
 
@@ -26,7 +26,7 @@ def draw(A: rf.Recording, B: rf.Recording, fits: dict, folder: pathlib.Path) -> 
 
 @styled
 def ringing(B: rf.Recording, fits: dict) -> Figure:
-    """Run B after a step, by models that learnt from A: what the hub does while the arm rings."""
+    """Run B after a step and free runs of models fitted to run A: the hub while the arm oscillates."""
     figure = blank(9, 5.2)
     top, bottom = figure.subplots(2, 1, sharex=True)
     inside = (B.t >= 4.9) & (B.t < 5.95)
@@ -55,7 +55,7 @@ def ringing(B: rf.Recording, fits: dict) -> Figure:
 
 @styled
 def errors(fits: dict) -> Figure:
-    """Errors of free runs of every structure, on the run it has not seen and on the one it has."""
+    """Errors of free runs of every structure, on the run of the fit and on the other run."""
     figure = blank(9, 4.2)
     axes = figure.subplots(1, 2, sharey=True)
     marks = {

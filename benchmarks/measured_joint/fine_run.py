@@ -1,8 +1,8 @@
-"""An integrator of its own for the measured joint: small steps, plain formulas, nothing of the toolkit in it.
+"""A separate integrator for the measured joint, which uses no code of the toolkit.
 
-Semi-implicit Euler steps of 0.2 ms; dry friction as an impulse that at most stops what moves; the law of
-LuGre along its own exponential. Fits through it are finite differences, seconds each, and a check of what
-the toolkit finds with the same laws.
+It takes semi-implicit Euler steps of 0.2 ms. Coulomb friction is an impulse that at most stops the motion;
+the state of LuGre friction follows its exponential solution within a step. Fits use finite differences and
+take seconds. Their results check those of the toolkit for the same laws.
 """
 
 import dataclasses
@@ -16,7 +16,7 @@ from scipy.optimize import least_squares
 import rotflex_jax as rf
 
 ARM_INERTIA = 0.003894  # trusted [kg m^2]
-# Name -> start, scale. Friction levels in N m, angles in rad; `drive` in N m/V, `offset` in V.
+# Parameter -> start, scale. Friction levels in N m, angles in rad; `drive` in N m/V, `offset` in V.
 NUMBERS: dict[str, tuple[float, float]] = {
     "drive": (0.165, 0.165),
     "hub_damping": (0.097, 0.1),
@@ -44,7 +44,7 @@ NONNEGATIVE = {
     "joint_beta",
 }
 LINEAR = ("drive", "hub_damping", "hub_inertia", "stiffness", "joint_damping")
-# Without damping of the bristles, which these runs do not determine.
+# Bristle damping is left out, because these runs do not determine it.
 LUGRE = ("level", "rise", "slow", "presliding")
 BOUC_WEN = ("joint_level", "joint_width", "joint_beta")
 STRUCTURES: dict[str, tuple[str, ...]] = {
@@ -55,14 +55,14 @@ STRUCTURES: dict[str, tuple[str, ...]] = {
 TAKEN = "LuGre at the hub, Bouc-Wen at the joint"
 OWN = ("offset", "bias")
 STEPS = 10  # per sample of 2 ms
-WINDOW, SEEN = 1000, 100  # samples; the first of a window do not count
-# What an error of one unit is in the cost [deg]: about what remains of hub angle and deflection.
+WINDOW, SEEN = 1000, 100  # samples of a window, and samples at its start that do not count
+# Scales of the errors of hub angle and deflection in the cost: about the errors that remain [deg].
 WEIGHTS = np.array([0.5, 0.15])
 
 
 @dataclasses.dataclass(frozen=True)
 class Found:
-    """Numbers common to all runs with what is each run's own, by name of the run; errors of the estimates."""
+    """Estimates: all parameters and their standard deviations, by name of the run and of the parameter."""
 
     numbers: dict[str, dict[str, float]]
     std: dict[str, dict[str, float]]
@@ -106,7 +106,7 @@ def _window(p, lugre, u, theta, alpha, Ts):
 
 
 class Law(NamedTuple):
-    """Equations of motion: names of the numbers in their order, and a run over one window."""
+    """Equations of motion: names of the parameters in their order, and a function that runs one window."""
 
     names: Sequence[str]
     window: Callable[..., np.ndarray]
@@ -131,7 +131,7 @@ def free_runs(
 def residual(
     numbers: dict[str, float], lugre: bool, run: rf.Recording, width: int = WINDOW, law: Law = RIGID
 ) -> np.ndarray:
-    """Errors (W, N, 2) of what counts [deg]."""
+    """Errors (W, N, 2) of free runs over windows, without the first `SEEN` samples of each [deg]."""
     y_hat = free_runs(numbers, lugre, run, width, law)
     e = np.degrees(y_hat - run.y[: len(y_hat)]).reshape(-1, width, 2)[:, SEEN:]
     return np.clip(np.nan_to_num(e, nan=100.0), -100.0, 100.0)
@@ -140,7 +140,7 @@ def residual(
 def rms(
     numbers: dict[str, float], lugre: bool, run: rf.Recording, width: int = WINDOW, law: Law = RIGID
 ) -> tuple[float, float]:
-    """Errors of hub angle and deflection [deg] in windows of so many samples."""
+    """Root mean square errors of hub angle and deflection over windows of `width` samples [deg]."""
     theta, alpha = np.sqrt(np.mean(residual(numbers, lugre, run, width, law) ** 2, axis=(0, 1)))
     return float(theta), float(alpha)
 
@@ -152,14 +152,14 @@ def fit(
     start: dict[str, float] | None = None,
     lugre: bool | None = None,
 ) -> Found:
-    """Least squares over windows: `free` common to the runs, `own` each run's.
+    """Least-squares fit to free runs over windows.
 
     Args:
-        runs: By name.
-        free: Numbers to fit, common to all.
-        own: Numbers to fit for each run by itself.
-        start: Numbers to begin with, and to hold where they are not fitted.
-        lugre: Whether the hub's friction is LuGre's; if None, where its numbers are free.
+        runs: Recordings by name.
+        free: Parameters to fit, common to all runs.
+        own: Parameters to fit separately for each run.
+        start: Initial values, which are kept for parameters that are not fitted.
+        lugre: Whether the hub has LuGre friction; if None, whether its parameters are in `free`.
     """
     lugre = "presliding" in free if lugre is None else lugre
     held = {k: v for k, (v, _) in NUMBERS.items()} | ({} if "joint_level" in free else {"joint_level": 0.0})
@@ -191,7 +191,7 @@ def fit(
 
 
 def _windows_std(J: np.ndarray, e: np.ndarray, windows: int) -> np.ndarray:
-    """Deviations from the scatter between windows: within one, errors are anything but independent."""
+    """Standard deviations from the scatter between windows, since errors within a window are correlated."""
     H = J.T @ J
     scores = np.einsum("wnp,wn->wp", J.reshape(windows, -1, J.shape[1]), e.reshape(windows, -1))
     inverse = np.linalg.pinv(H, rcond=1e-12)

@@ -1,11 +1,13 @@
 """The measured joint with play in the gear: motor and hub are two bodies that touch at the ends of a gap.
 
-    motor  (1 - share) J vm' = drive (v + offset) - damping vm - friction(vm) - contact
-    hub          share J v'  = contact + spring - load_level sign v
-    contact = stiff (|m - theta| - gap) where that is positive
+    motor   (1 - share) J vm' = drive (u + offset) - damping vm - friction(vm) - contact
+    hub           share J v'  = contact + joint - load_level sign(v)
+    arm          arm_inertia w' = -joint
+    contact = side max(stiff (|m - theta| - gap) + damp side (vm - v), 0)  where |m - theta| > gap
 
-Integrated as in `fine_run`, whose laws of friction and of the joint these are. The sensor is at the hub,
-behind the play.
+m is the angle of the motor at the output of the gear, theta that of the hub, side the sign of m - theta, and
+gap is half of the play. Integration rule, friction laws and the torque of the joint are those of `fine_run`.
+The sensor of the hub angle is on the load side of the play.
 """
 
 from collections.abc import Sequence
@@ -18,7 +20,7 @@ import rotflex_jax as rf
 from measured_joint import fine_run
 from measured_joint.fine_run import ARM_INERTIA, STEPS, WEIGHTS, Law, _shrink, residual, rms
 
-# Stiffness and damping of the contact [N m/rad, N m s/rad]: stiff enough for the steps, and held.
+# Stiffness and damping of the contact [N m/rad, N m s/rad]. They are constants and are not fitted.
 STIFF, SOFT = 150.0, 0.05
 NUMBERS: dict[str, tuple[float, float]] = fine_run.NUMBERS | {
     "share": (0.25, 0.3),
@@ -76,7 +78,7 @@ def _window(p, lugre, u, theta, alpha, Ts):
     return out
 
 
-# Runs begin at rest in the middle of the play.
+# Every run starts at rest in the middle of the play.
 LAW = Law(tuple(NUMBERS), _window)
 
 
@@ -86,7 +88,7 @@ def fit(
     lugre: bool,
     start: dict[str, float] | None = None,
 ) -> dict[str, float]:
-    """Numbers with the least squared free runs over windows of one run."""
+    """All parameters, the free ones fitted to one run by least squares of free-run errors over windows."""
     held = {k: v for k, (v, _) in NUMBERS.items()} | {
         k: 0.0 for k in ("joint_level", "load_level") if k not in free
     }
@@ -106,7 +108,11 @@ def fit(
 
 
 def compare(A: rf.Recording, B: rf.Recording) -> dict:
-    """Each structure learnt from one run and evaluated on both, as the table of `fits` has it."""
+    """Fits each structure to each of the two runs, and evaluates each fit on both runs.
+
+    The errors are those of free runs over windows, without offset and with the offset fitted to the evaluated
+    run, and of one free run over the whole recording with this offset.
+    """
     runs, out = {"A": A, "B": B}, {}
     for name, free in STRUCTURES.items():
         lugre = "presliding" in free

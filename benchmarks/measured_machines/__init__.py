@@ -1,1 +1,1 @@
-"""Measured machines of the registry, how their recordings are parted, and what a search makes of them."""
+"""B9: searches on the measured machines of the registry, in one process per direction, and their page."""

@@ -1,4 +1,4 @@
-"""One direction of one machine in a process of its own; the last line that it prints is JSON.
+"""Runs one direction of one machine in a separate process; the last line that it prints is JSON.
 
 python -c "from measured_machines.child import main; main()" MACHINE DIRECTION cold METHOD...
 python -c "from measured_machines.child import main; main()" MACHINE DIRECTION warm
@@ -38,7 +38,10 @@ def main() -> None:
 def row(
     machine: str, direction: str, all_of_it: bool, methods: Sequence[str], say: Callable[[str], None]
 ) -> dict[str, Any]:
-    """What a search finds and how well it does; without `all_of_it` what it finds and its times alone."""
+    """Result of a search, with errors on test data, bands and other methods.
+
+    Without `all_of_it`, only the effects that were found and the times of the search.
+    """
     model = MACHINES[machine].model()
     way = next(w for w in MACHINES[machine].ways() if w.name == direction)
     clock, processor = time.perf_counter(), time.process_time()
@@ -61,11 +64,11 @@ def row(
         "left_out": last.get("left_out", []),
         "friction_of_runs": last.get("friction_of_runs", {}),
         "estimates": estimates(result.final),
-        # What the search itself reports, all keys that it has, and the same again by the public interface.
+        # Errors that the search reports. `simulated` has errors on test data by the public interface.
         "reported": {
             "baseline": reported(told["baseline"]),
             "final": reported((told["rounds"] or [told["baseline"]])[-1]),
-            # The last one, fitted to training and validation recordings, where the search has done that.
+            # The final fit to training and validation recordings, if the search made one.
             "fitted to all": reported(last) if last else None,
         },
         "simulated": {
@@ -83,7 +86,7 @@ def row(
 
 
 def bands(result: rf.Discovery, recording: rf.Recording) -> dict[str, Any]:
-    """Share of the samples of a test recording in their band, its mean half width, and what widens it."""
+    """Band of a test recording: share of samples inside, mean half width, and shares of its variance."""
     try:
         return result.prediction_bands(recording).to_dict()
     except rf.InputError as problem:
@@ -91,12 +94,12 @@ def bands(result: rf.Discovery, recording: rf.Recording) -> dict[str, Any]:
 
 
 def reported(stage: dict[str, Any]) -> dict[str, Any]:
-    """Errors of a stage of a search, by the names that its JSON has for them."""
+    """Errors of a stage of a search on validation and test data, with their keys in the JSON."""
     return {k: v for k, v in stage.items() if k.startswith(("held_out_rmse", "test_rmse"))}
 
 
 def compared(model: rf.Model, way: Way, methods: Sequence[str], say: Callable[[str], None]) -> dict[str, Any]:
-    """Other methods on the same data, best first; they are fitted to training and validation recordings."""
+    """Other methods, fitted to training and validation recordings and evaluated on the test, best first."""
     began = time.perf_counter()
     table = rf.compare(
         [*way.train, *way.validation], methods, mechanism=model, test=list(way.test), progress=say

@@ -32,10 +32,10 @@ variance."""
 
 
 def evaluated(row: Row, stage: str) -> tuple[dict[str, Any], str]:
-    """Errors of a stage on the test by kind, and where they are from.
+    """Errors of a stage on the test by kind, and their source.
 
-    The search's own where it reports any on test recordings; otherwise simulated by the benchmark with the
-    public interface.
+    The errors that the search reports, if it reports any on test recordings; otherwise those that the
+    benchmark computed with the public interface.
     """
     own = row["reported"][stage]
     if own.get(KEYS["whole"]):
@@ -44,7 +44,7 @@ def evaluated(row: Row, stage: str) -> tuple[dict[str, Any], str]:
 
 
 def held_out(row: Row, stage: str) -> dict[str, Any]:
-    """Errors that the search reports on the validation part, on which it chose the model."""
+    """Errors that the search reports on the validation data, on which it chose the model."""
     own = row["reported"][stage]
     return {
         "whole": _channels(own.get("held_out_rmse")),
@@ -58,7 +58,7 @@ def _channels(errors: dict[str, Any] | None) -> dict[str, Any] | None:
 
 
 def told(errors: dict[str, Any] | None, factor: float) -> str:
-    """Errors of all channels in the unit of the machine."""
+    """Text with the errors of all channels, in the unit of the machine."""
     if not errors:
         return "-"
     return " / ".join("-" if v is None else _short(factor * v) for v in errors.values())
@@ -69,7 +69,7 @@ def _short(value: float) -> str:
 
 
 def said(row: Row) -> str:
-    """What was found."""
+    """Text with the effects that were found; provisional ones are in brackets."""
     parts = []
     for r in row["rounds"]:
         text = f"{r['effect']}@{r['port']}"
@@ -79,7 +79,7 @@ def said(row: Row) -> str:
 
 
 def differences_from_found(row: Row) -> str:
-    """In what the fit to all differs from what was found."""
+    """Text with the differences between the structure of the final fit and the structure that was found."""
     pairs = (("@".join(x["used"]), "@".join(x["found"])) for x in row.get("laws", []))
     without = (f"{x['effect']}@{x['port']}" for x in row.get("left_out", []))
     parts = [f"{used} for {found}" for used, found in pairs] + [f"without {x}" for x in without]
@@ -88,7 +88,7 @@ def differences_from_found(row: Row) -> str:
 
 
 def best(row: Row) -> tuple[str, dict[str, Any] | None, dict[str, Any] | None]:
-    """Best of the other methods: its name and its two errors on the test."""
+    """Name of the best other method, and its errors of whole runs and of windows on the test."""
     rows = [r for r in (row["others"] or {"rows": []})["rows"] if r["status"] == "ok"]
     if not rows:
         return "-", None, None
@@ -96,7 +96,7 @@ def best(row: Row) -> tuple[str, dict[str, Any] | None, dict[str, Any] | None]:
 
 
 def times(row: Row) -> list[str]:
-    """Seconds by the clock and of the processor, cold and warm."""
+    """Wall-clock and processor seconds of the search, with nothing compiled and with everything compiled."""
     cells = []
     for state in ("cold", "warm"):
         found = row.get(state)
@@ -105,7 +105,7 @@ def times(row: Row) -> list[str]:
 
 
 def page(results: dict[str, Any]) -> str:
-    """All rows, then what was left out."""
+    """The page: errors, verdicts and times, bands, then failures and machines that were left out."""
     rows = [results["rows"][k] for k in sorted(results["rows"], key=_place)]
     good = [r for r in rows if "error" not in r]
     lines = [
@@ -144,7 +144,7 @@ def page(results: dict[str, Any]) -> str:
 
 
 def bands_of_tests(rows: list[Row]) -> list[str]:
-    """Table of the bands over test recordings, of directions that have some."""
+    """Table of the bands over test recordings, for the directions that have bands."""
     lines = [
         "| machine | direction | unit | samples inside [%] | mean half width | widened by |",
         "|---|---|---|---:|---:|---|",
@@ -163,13 +163,13 @@ def bands_of_tests(rows: list[Row]) -> list[str]:
 
 
 def most_of(shares: dict[str, float]) -> str:
-    """The largest parts of a variance, down to a fifth of it."""
+    """Text with the parts that make at least a fifth of a variance, largest first."""
     large = sorted((pair for pair in shares.items() if pair[1] >= 0.2), key=lambda pair: -pair[1])
     return ", ".join(f"{name} {100 * share:.0f} %" for name, share in large)
 
 
 def _place(key: str) -> tuple[int, str]:
-    """Rows in the order of the machines."""
+    """Sort key of a row: the place of its machine in the registry."""
     names = list(MACHINES)
     machine = key.split(":")[0]
     return (names.index(machine) if machine in names else len(names), key)

@@ -1,4 +1,4 @@
-"""EMPS: effects by discovery, then by free runs, within the training record; then the official test."""
+"""EMPS: effects found by the search and then by free runs on the training recording; official test errors."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from rotflex_jax.mechanism.roles import search_places
 def run(say: Say) -> dict[str, Any]:
     benchmark = rf.data.benchmark("emps")
     start, train = rf.joints.emps(), benchmark.train
-    # The carriage stands still between strokes for milliseconds only: laws with memory are left out.
+    # Laws with memory are left out, since the carriage stands still between strokes for milliseconds only.
     slow = {"lugre", "dahl", "bouc_wen", "backlash"}
     candidates = [place for place in search_places(start) if place[0].name not in slow]
-    # A third round finds a part of 0.3 kg that swings at 19 Hz: nothing that a free run would notice.
+    # A third round would add a mass of 0.3 kg that oscillates at 19 Hz, which does not improve free runs.
     result = rf.discover(start, *train.split(0.7), candidates=candidates, rounds=2, progress=say)
     rows = [
         {
@@ -28,7 +28,8 @@ def run(say: Say) -> dict[str, Any]:
         for label, stage in zip(labels(result), result.stages, strict=True)
     ]
     machines = [_as_found(start, stage.model.mechanism) for stage in result.stages]
-    # A drift belongs to a recording, so that the search of the toolkit leaves it out; free runs ask for it.
+    # `rf.discover` leaves out the drift, since it belongs to a recording. Here it is a candidate, since free
+    # runs over the whole recording depend on it.
     grown = grow(machines[-1], train, [*candidates, (VoltageDrift, "input")], say)
     for entry in grown:
         if entry["taken"] is not None:
@@ -38,7 +39,7 @@ def run(say: Say) -> dict[str, Any]:
         found = fitted(machine, train)
         row |= {"free run": benchmark.score(rf.Model(found)), "trained": 1e3 * error(found, train)}
         say(f"{row['model']}: {row['trained']:.2f} mm on the training record, {row['free run']}")
-        if number == len(rows) - 1:  # the same optimum, with intervals
+        if number == len(rows) - 1:  # `rf.fit` from this optimum, for intervals
             last = rf.fit(found, train, first="measured")
             row |= {"free-run estimates": estimates(last), "status": last.status}
             row["free run"] = benchmark.score(last.model)
@@ -55,7 +56,7 @@ def run(say: Say) -> dict[str, Any]:
 
 
 def _as_found(start: rf.Mechanism, found: rf.Mechanism) -> rf.Mechanism:
-    """The machine with the effects that were found, without the offset that the search carries along."""
+    """The first machine with the effects that were found, without the offset that the search adds."""
     named = found.named_values
     machine = start
     for effect in found.effects:

@@ -1,9 +1,9 @@
-"""A search that fits and decides by free runs, within a training record alone.
+"""Stepwise search that fits and compares by free runs over a training recording.
 
-The search of the toolkit compares predictors, whose horizon is short. What acts slowly, a drift of an offset
-for instance, hardly shows there and decides a free run of 25 s. Here effects are added one at a time to what
-that search found: each candidate is fitted to one free run over the first part of the record and evaluated by
-one over the rest, then the other way round.
+`rf.discover` compares predictions and short free runs. A slow effect, such as the drift of an offset, hardly
+changes those but dominates a free run of 25 s. Here effects are added one at a time to the structure that
+`rf.discover` found. Each candidate is fitted to a free run over the first 70 % of the recording and evaluated
+by a free run over the rest, and then fitted to the last 70 % and evaluated on the first 30 %.
 """
 
 from __future__ import annotations
@@ -21,14 +21,17 @@ from public_machines.rounds import Say
 from rotflex_jax.discover.supermodel import scales
 from rotflex_jax.effects.base import Effect
 
-# Both held-out runs must come down to this share, or an effect is not taken.
+# An effect is added only if the errors of both held-out runs fall below this share of their present values.
 BETTER = 0.9
 SHARE = 0.7
 TYPICAL_FORCE = 500.0
 
 
 def fitted(machine: rf.Mechanism, record: rf.Recording, most: int = 40) -> rf.Mechanism:
-    """Numbers with the least squared free run, the first state as the first samples tell it."""
+    """The machine with free parameters fitted by least squares of one free run.
+
+    The first state is estimated from the first samples.
+    """
     named = machine.named_values
     specs = dict(zip(machine.parameter_names, machine.parameter_specifications, strict=True))
     free = machine.free_names
@@ -42,7 +45,8 @@ def fitted(machine: rf.Mechanism, record: rf.Recording, most: int = 40) -> rf.Me
         return np.clip(np.nan_to_num(e.ravel(), nan=10.0), -10.0, 10.0)
 
     begin = np.clip(np.array([named[n] for n in free]) / size, low + 1e-6, high - 1e-6)
-    # The valley is long and narrow, and contacts that stop make it a little rough: scaled steps, not small.
+    # The minimum lies in a long narrow valley, so steps are scaled by the Jacobian. Sticking makes the cost
+    # slightly rough, so differences for the Jacobian are not small.
     found = least_squares(
         missed, begin, bounds=(low, high), x_scale="jac", diff_step=1e-3, max_nfev=most, ftol=1e-6
     )
@@ -50,9 +54,9 @@ def fitted(machine: rf.Mechanism, record: rf.Recording, most: int = 40) -> rf.Me
 
 
 def missed_by(machine: rf.Mechanism, record: rf.Recording) -> np.ndarray:
-    """Errors of one free run over a part of a record, after the first samples (N, C) [output].
+    """Errors of one free run over a part of a recording, after its first `n_init` samples (N, C) [output].
 
-    A drift counts from the beginning of the record, so that it is further on in a later part.
+    A drift of the voltage is counted from the start of the recording, not from that of the part.
     """
     name = "input.voltage_drift.rate"
     rate = machine.named_values.get(name, 0.0)
@@ -61,12 +65,12 @@ def missed_by(machine: rf.Mechanism, record: rf.Recording) -> np.ndarray:
 
 
 def error(machine: rf.Mechanism, record: rf.Recording) -> float:
-    """Root mean square of these [output]."""
+    """Root mean square error of one free run [output]."""
     return float(np.sqrt(np.mean(missed_by(machine, record) ** 2)))
 
 
 def held_out(machine: rf.Mechanism, record: rf.Recording) -> tuple[float, float]:
-    """Errors over the last and the first part of a record, each learnt from the other part [output]."""
+    """Errors over the last and over the first 30 %, each with parameters fitted to the rest [output]."""
     n = round(SHARE * record.N)
     there = error(fitted(machine, record.slice(0, n)), record.slice(n, record.N))
     back = error(fitted(machine, record.slice(record.N - n, record.N)), record.slice(0, record.N - n))
@@ -79,11 +83,11 @@ def grow(
     candidates: Iterable[tuple[type[Effect], str]],
     say: Say,
 ) -> list[dict[str, Any]]:
-    """What is taken, round by round, with the held-out errors of all that was tried.
+    """Adds the best candidate in each round, until none improves both held-out errors enough.
 
     Returns:
-        One entry per round: the `machine` it began with and its `held_out` errors, what was `tried`, name to
-        held-out errors, and `taken`. The last one takes nothing.
+        One entry per round: `machine` before the round, its `held_out` errors, `tried` (candidate -> held-out
+        errors), and `taken`, the name of the added effect, which is None in the last entry.
     """
     there = {(e.name, e.at) for e in machine.effects}
     left, found = [c for c in candidates if (c[0].name, c[1]) not in there], []
@@ -100,7 +104,7 @@ def grow(
                 for direction in cls.probes(sizes[place])
                 for probe in direction
             ]
-            # From each shape that the effect proposes; what runs best over the record goes on.
+            # The effect is fitted from each of its probes, and the fit with the least error is kept.
             grown[name] = min((fitted(m, record, 12) for m in begun), key=lambda m: error(m, record))
             tried[name] = held_out(grown[name], record)
             say(f"  {name}: " + " and ".join(f"{e:.4g}" for e in tried[name]))
@@ -117,5 +121,5 @@ def grow(
 
 
 def tried(grown: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """The rounds as plain numbers [output]."""
+    """The rounds without machines, for JSON [output]."""
     return [{key: entry[key] for key in ("round", "held_out", "tried", "taken")} for entry in grown]

@@ -1,4 +1,4 @@
-"""The Silverbox: discovery on the beginning of the official training record, numbers as they come out."""
+"""The Silverbox: search on the first part of the official training recording; official test errors."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 import rotflex_jax as rf
 from public_machines.rounds import Say, estimates, labels, told
 
-# A quarter of the training record is plenty for three or four effects, and takes a quarter of the time.
+# A quarter of the training recording suffices for three or four effects, and takes a quarter of the time.
 SAMPLES = 16000
 
 

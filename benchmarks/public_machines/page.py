@@ -34,7 +34,7 @@ def _case(case: dict[str, Any]) -> list[str]:
 
 
 def _free_round(entry: dict[str, Any]) -> str:
-    """What a round of the search by free runs tried, errors of both held-out parts in thousandths."""
+    """Text on a round of the search by free runs, with the held-out errors of the best candidates."""
     pair = lambda e: " and ".join(f"{1e3 * v:.3g}" for v in e)  # noqa: E731
     nearest = sorted(entry["tried"], key=lambda k: entry["tried"][k][0] * entry["tried"][k][1])[:4]
     listed = ", ".join(f"{k} {pair(entry['tried'][k])}" for k in nearest)
@@ -45,7 +45,7 @@ def _free_round(entry: dict[str, Any]) -> str:
 
 
 def _errors(case: dict[str, Any]) -> list[str]:
-    """Root mean square errors of free runs, round by round, published ones below."""
+    """Table of root mean square errors of free runs, one row per stage, with published errors below."""
     tests = list(case["rows"][0]["free run"])
     both = "search" in case["rows"][0]
     heads = [f"{t} [{case['unit']}]" for t in tests]

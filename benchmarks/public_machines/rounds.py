@@ -1,4 +1,4 @@
-"""A discovery as rows of a table: each model on the way, fitted and scored."""
+"""Result of a search as rows of a table, one for each stage."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ Say = Callable[[str], None]
 
 
 def estimates(found: Any) -> dict[str, Any]:
-    """Fitted parameters with their intervals; `found` is a stage of a discovery or a fit."""
+    """Fitted parameters with their intervals; `found` is a stage of a search or a fit."""
     listed = found.estimates if hasattr(found, "estimates") else found.parameters
     return {e.name: e.to_dict() for e in listed if e.free}
 
 
 def labels(result: rf.Discovery) -> list[str]:
-    """What each model on the way has more than the one before."""
+    """Labels of the stages: the effect that each one adds to the stage before."""
     return ["the machine as it is", *(f"{r.effect} at {r.port}" for r in result.rounds)]
 
 
 def told(result: rf.Discovery) -> dict[str, Any]:
-    """What a discovery says in words."""
+    """Verdict, rounds, notes and conditional intervals of a search, for JSON."""
     return {
         "verdict": result.verdict,
         "sentence": result.sentence,

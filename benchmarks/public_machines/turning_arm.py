@@ -1,4 +1,4 @@
-"""The rotary arm: one run with the rigid arm to fit and others to evaluate on; one cut in two."""
+"""The rotary arm: rigid, fitted to one run and evaluated on others; flexible, fitted to part of one run."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ def rigid(say: Say) -> dict[str, Any]:
     _, slow, fast, other = rf.data.load_dataset("rotary_arm")
     tests = {"gain 8": fast, "gains 1 and 3": other}
     found = _learnt(rf.joints.rotary_arm(), [slow], tests, say)
-    # The arm rests most of the time, and a predictor learns little from rest: free runs learn the moves.
+    # The arm rests most of the time, and predictions at rest contain little information on the parameters.
+    # So the model is also fitted to free runs.
     by_hand = rf.joints.rotary_arm() + Coulomb(at="hub", level=0.03)
     for label, machine in (
         ("the machine with dry friction, fitted to free runs", by_hand),
@@ -46,7 +47,7 @@ def _learnt(
 
 
 def _errors(model: rf.Model, tests: dict[str, rf.Recording]) -> dict[str, Any]:
-    """Errors of one free run over each test, and of runs over windows of 2 s of all [mrad]."""
+    """Errors of a free run over each test, and of free runs over windows of 2 s of all tests [mrad]."""
     free = {
         f"{name}, {channel}": 1e3 * error
         for name, test in tests.items()

@@ -1,6 +1,6 @@
-"""The tables that worked the seed paper through, beside numbers computed without this package.
+"""B2: tables of results on the seed paper, compared with values computed without this package.
 
-One module per table has `blocks(quick, say)`, which yields its parts as `Block`. `reference.json`
-holds the numbers of independent prototypes; `blocks.py` sets the two side by side, `page.py` prints
-them.
+One module per table has a function `blocks(quick, say)` that yields the parts of the table as `Block`.
+`reference.json` has the values of independent prototypes, `blocks.py` compares the two, and `page.py` writes
+them as Markdown.
 """

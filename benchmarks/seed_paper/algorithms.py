@@ -20,7 +20,7 @@ EPS = 1e-3
 
 
 def cases() -> dict[str, tuple[Volterra, float]]:
-    """Series and sampling interval: 21, 10 and 153 weights."""
+    """Volterra series and sampling interval of each case, with 21, 10 and 153 weights."""
     return {
         "A": (Volterra(Delays(5, first=0), order=2), 0.1),
         "B": (Volterra(Orthonormal.at(plant_poles(), 0.02), order=2), 0.02),
@@ -29,32 +29,35 @@ def cases() -> dict[str, tuple[Volterra, float]]:
 
 
 def lms(setting):
-    """One step size for every weight."""
+    """LMS with a step size for each weight."""
     return LMS(mu=setting)
 
 
 def nlms(setting):
-    """Normalised."""
+    """Normalised LMS."""
     return NLMS(mu=setting[0], eps=EPS)
 
 
 def apa(setting):
-    """Four samples at a time."""
+    """Affine projection over four samples."""
     return AffineProjection(mu=setting[0], eps=EPS, window=4)
 
 
 def rls(setting):
-    """No forgetting."""
+    """Recursive least squares without forgetting."""
     return RLS(lam=1.0, delta=setting[0])
 
 
 def kalman(setting):
-    """Weights that wander a little."""
+    """Kalman filter for weights on a slow random walk."""
     return Kalman(q=setting[0], r=1.0, p0=1e6)
 
 
 def step_grid(task: Task, shares: list[tuple[float, float]]) -> np.ndarray:
-    """Step sizes (S, P): shares of the powers for constant and linear, and for quadratic regressors."""
+    """Step sizes (S, P) of pairs of shares, each divided by the power of the regressors of its degree.
+
+    The first share is for constant and linear weights, the second for quadratic ones.
+    """
     p1, p2 = task.powers()
     return np.array([np.where(task.degrees == 2, b / p2, a / p1) for a, b in shares])
 
@@ -62,14 +65,15 @@ def step_grid(task: Task, shares: list[tuple[float, float]]) -> np.ndarray:
 SHARES = [(a, b) for a in np.geomspace(0.01, 0.5, 6) for b in np.geomspace(0.001, 0.1, 6)]
 STEPS = np.array([0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0])[:, None]
 GIVEN = {"A": (0.01, 1.9e-4), "B": (1.3e-3, 2.2e-5)}
-"""Best step sizes of the reference."""
+"""Best step sizes of the reference, for constant and linear weights and for quadratic ones."""
 
 
 def learned(task: Task, filter_of: Callable, settings: np.ndarray) -> tuple[float | None, float, float]:
-    """Samples until the mean over runs is at the level, their scatter, and the excess error in the end.
+    """Samples until the excess error is below the level, their scatter, and the excess error in the end.
 
-    Of the best of several settings: the first to get there among those that stay there, or the one with the
-    least error in the second half.
+    The excess error is a mean over runs, and in the end means over the second half of the samples. Among
+    settings whose error is below the level in the end, the values are those of the fastest. If there is none,
+    the number of samples is None, the scatter zero, and the error the least of all settings.
     """
     d = distances(filter_of, settings, task.phi, task.y, task.root, task.target)
     d = np.where(np.isfinite(d), d, np.inf)
@@ -169,14 +173,14 @@ def blocks(quick: bool, say: Callable[[str], None]) -> Iterator[Block]:
 
 
 def after(task: Task, k: int, n: int) -> float:
-    """Excess error of ridge regression on the first samples of a run."""
+    """Excess error of ridge regression on the first n samples of run k."""
     X, y = task.phi[k, :n], task.y[k, :n]
     w = np.linalg.solve(X.T @ X + 1e-6 * np.eye(X.shape[1]), X.T @ y)
     return float(np.sum((task.root @ (w - task.target)) ** 2))
 
 
 def rest_of_nlms(N: int) -> Block:
-    """The point that NLMS comes to rest at, by its equation and by running it."""
+    """Fixed point of NLMS from its equation, compared with the mean weights of a long run."""
     basis, Ts = cases()["A"]
     task = Task.of("S6", basis, Ts, N, 4)
     mu = 0.002

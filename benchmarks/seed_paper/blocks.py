@@ -1,4 +1,4 @@
-"""A part of a table: numbers by row and column, with what they are compared against."""
+"""A part of a table: numbers by row and column, compared with the reference."""
 
 from __future__ import annotations
 
@@ -11,25 +11,26 @@ from typing import Any
 REFERENCE: dict[str, Any] = json.loads(Path(__file__).with_name("reference.json").read_text())["tables"]
 
 Number = float | None
-"""None where something never happens, NaN where there is nothing to compute."""
+"""None for an event that never happens, NaN for a cell that is left empty."""
 
 SPREADS = 3.0
-"""Numbers from noise may differ by this many standard deviations of what one record gives."""
+"""Numbers with a spread may differ by this many standard deviations of a single recording."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Block:
-    """Numbers with their tolerance and their story.
+    """Numbers with their tolerances, and notes on differences from the reference.
 
     Attributes:
-        title: Key in `reference.json` too.
+        title: Title, and key in `reference.json`.
         about: What was computed, in a sentence or two.
-        columns: Names.
+        columns: Names of the columns.
         rows: Numbers by row.
-        spread: Standard deviation over records, where a number is a mean over records.
+        spread: Standard deviations over recordings or runs, for numbers that are means over them.
         relative: Tolerance, as a share of the reference.
-        absolute: Tolerance, in the unit of the number: half of the last digit that the reference has.
-        notes: Why numbers differ, found by trying: by "" for all, a row, a column or "row | column".
+        absolute: Tolerance, in the unit of the number, for instance half of the last digit of the reference.
+        notes: Reasons of differences, found by experiment. A key is "" for all numbers, a row, a column or
+            "row | column".
     """
 
     title: str
@@ -42,7 +43,7 @@ class Block:
     notes: dict[str, str] = dataclasses.field(default_factory=dict)
 
     def beside(self, section: str) -> dict[str, Any]:
-        """As JSON, every number with its reference, the difference, and whether it is within tolerance."""
+        """The part for JSON: numbers with reference, difference and whether this is tolerated."""
         given = REFERENCE.get(section, {}).get(self.title, {})
         rows, beyond, unexplained = {}, [], []
         for row, values in self.rows.items():
@@ -69,7 +70,11 @@ class Block:
 
 
 def _cell(value: Number, spread: Number, given: Any, block: Block) -> dict[str, Any]:
-    """One number; `given` is a number, None (never), an interval, or "none" where there is no reference."""
+    """One number with its comparison.
+
+    The reference `given` is a number, an interval, None for an event that never happens, or "none" if there
+    is no reference.
+    """
     if value is not None and math.isnan(value):
         return {}
     cell: dict[str, Any] = {"value": finite(value)}
@@ -89,12 +94,15 @@ def _cell(value: Number, spread: Number, given: Any, block: Block) -> dict[str, 
 
 
 def finite(x: Number) -> Number:
-    """JSON knows neither NaN nor infinity."""
+    """The number, or None in place of NaN and infinity, which JSON does not have."""
     return None if x is None or not math.isfinite(x) else float(x)
 
 
 def mean_and_spread(values: list[list[Number]]) -> tuple[tuple[Number, ...], tuple[Number, ...]]:
-    """Over records, one list of numbers each; a number that never came to be in one record has no mean."""
+    """Means and standard deviations over recordings, from one list of numbers for each recording.
+
+    A number that is None for one recording has neither.
+    """
     means, spreads = [], []
     for column in zip(*values, strict=True):
         if any(v is None for v in column):

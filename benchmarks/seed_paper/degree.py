@@ -1,4 +1,4 @@
-"""2.4: which degree of the series helps, and a model of the physics beside it."""
+"""2.4: held-out errors of Volterra series by degree, and of a physical model for comparison."""
 
 from __future__ import annotations
 
@@ -37,25 +37,25 @@ def blocks(quick: bool, say: Callable[[str], None]) -> Iterator[Block]:
 
 
 def recording(u: np.ndarray, y: np.ndarray, Ts: float) -> Recording:
-    """Of the deflection alone."""
+    """A recording of the deflection alone."""
     return Recording(u=u, y=y, Ts=Ts, channels="alpha", n_init=1)
 
 
 def held_out(basis: Volterra, scenario: str, Ts: float, N: int, seed: int) -> float:
-    """NMSE on data that the fit did not see."""
+    """NMSE of a least-squares fit on a second recording, which was not used for the fit."""
     (u, y), (v, z) = (record(scenario, Ts, N, CUTOFF, 2 * seed + k) for k in (0, 1))
     fit = least_squares(basis, recording(u, y, Ts), "alpha")
     return nmse(z, fit.model.simulate(recording(v, z, Ts))[:, 0])
 
 
 def adapted(scenario: str, Ts: float, N: int, seed: int) -> Orthonormal:
-    """Three functions with poles fitted to the training record."""
+    """Three orthonormal functions with poles fitted to the training recording."""
     u, y = record(scenario, Ts, N, CUTOFF, 2 * seed)
     return optimise_poles(u, y, Orthonormal.at(plant_poles(), Ts).poles)[0]
 
 
 def by_degree(N: int, records: int, about: str, say: Callable[[str], None]) -> Block:
-    """All scenarios with a spring between linear and hardening."""
+    """Errors by degree and sampling interval, for the scenarios whose spring is linear or hardening."""
     rows, spread = {}, {}
     for scenario in SCENARIOS:
         say(scenario)
@@ -82,7 +82,7 @@ def by_degree(N: int, records: int, about: str, say: Callable[[str], None]) -> B
 
 
 def springs(N: int, records: int, about: str, say: Callable[[str], None]) -> Block:
-    """Scenarios whose spring is not the same both ways."""
+    """Errors of linear and quadratic series for the scenarios with an asymmetric spring."""
     bases = (
         Volterra(Delays(5, first=0), order=1, constant=False),
         Volterra(Delays(5, first=0), order=1),
@@ -105,7 +105,7 @@ def springs(N: int, records: int, about: str, say: Callable[[str], None]) -> Blo
 
 
 def significance(N: int, records: int) -> Block:
-    """Textbook t-values, as if the residual were white: the reference has these."""
+    """Largest t-value of a quadratic coefficient, for a white residual, as in the reference."""
     basis = Volterra(Delays(5, first=0), order=2)
     rows, spread = {}, {}
     for scenario in ("S0", "S1", "S4", "S5p", "S6", "S5s"):
@@ -129,7 +129,7 @@ def significance(N: int, records: int) -> Block:
 
 
 def five_functions(N: int, records: int) -> Block:
-    """A real pole and two pairs."""
+    """Errors with five functions, whose poles are a real one and two pairs."""
     Ts, values = 0.02, []
     fast = complex(-20, 40)
     for seed in range(records):
@@ -160,7 +160,7 @@ UNKNOWN = {
 
 
 def grey_box() -> Block:
-    """The physics with unknown numbers, from what two encoders saw."""
+    """Fit of the physical parameters to the quantised readings of two encoders."""
     Ts, N = 0.02, 1500
     truth = plant("S1")
     step = 2 * np.pi / 4096

@@ -1,4 +1,4 @@
-"""0: three facts that decide how such models are judged."""
+"""0: three facts that matter for the evaluation of such models."""
 
 from __future__ import annotations
 
@@ -36,7 +36,11 @@ def blocks(quick: bool, say: Callable[[str], None]) -> Iterator[Block]:
 
 
 def trap(N: int, records: int) -> Block:
-    """Five delays at 1 ms: the a-priori error tells nothing about the model."""
+    """A-priori errors of LMS against errors of its last weights on another recording, with 1 ms sampling.
+
+    The a-priori error of LMS is below the error of least squares, but the frozen weights of LMS predict worse
+    than the mean does.
+    """
     basis = Volterra(Delays(5, first=0), order=2)
     mu = basis.step_sizes({0: MU1, 1: MU1, 2: MU2})
     lms, batch = [], []
@@ -61,7 +65,10 @@ def trap(N: int, records: int) -> Block:
 
 
 def parity(N: int) -> Block:
-    """Least squares on a record and its mirror image, plant S1."""
+    """Least squares on a recording of S1 together with the recording for the negative input.
+
+    The plant is odd, so quadratic terms do not reduce the error and even coefficients are zero.
+    """
     u = voltage(N, 0.1, 5.0, 0)
     y = deflection("S1", u, 0.1)
     both = (np.concatenate(pair) for pair in ((u, -u), (y, deflection("S1", -u, 0.1))))

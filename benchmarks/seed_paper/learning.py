@@ -1,4 +1,4 @@
-"""How many samples adaptive filters need: many filters and records at once, stopped when all are there."""
+"""Learning curves of adaptive filters, for many filters and recordings at once."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from rotflex_jax.runtime.xla import double_precision
 from seed_paper.records import record
 
 EVERY = 10
-"""Samples between two looks at the weights."""
+"""Samples between two evaluations of the weights."""
 
 CUTOFF = 2.0
-"""Of the input where filters are compared [Hz]."""
+"""Cutoff of the input in comparisons of filters [Hz]."""
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -33,7 +33,7 @@ def _part(
     root: Any,
     target: Any,
 ) -> tuple[Any, Any]:
-    """States after a part of the records and `|root (w - target)|^2` on the way (runs, settings, looks)."""
+    """States after a part of the recordings, and `|root (w - target)|^2` (runs, settings, evaluations)."""
 
     def one_run(state, phi, y, target):
         def one_filter(setting, state):
@@ -62,17 +62,18 @@ def distances(
     below: float = 0.0,
     part: int = 5000,
 ) -> np.ndarray:
-    """Squared distance of the weights from the target after every `EVERY` samples (runs, settings, looks).
+    """Squared distance of the weights from the target every `EVERY` samples (runs, settings, evaluations).
 
     Args:
-        filter_of: filter from one row of the settings; a named function, as it decides what is compiled.
+        filter_of: function from a row of the settings to a filter. Use a module-level function, since a new
+            function is compiled again.
         settings: one row per filter (S, k).
         phi: regressors (runs, N, P).
         y: outputs (runs, N).
         root: (K, P), so that the distance is `|root (w - target)|^2`.
         target: weights (P,), or (runs, P).
-        below: stop when some filter came below it in every run.
-        part: samples in one call, a multiple of `EVERY`.
+        below: stop once at least one filter has come below this distance in every run.
+        part: samples in one call, a multiple of `EVERY`; an incomplete last part is left out.
     """
     runs, N = y.shape
     part = min(part, N // EVERY * EVERY)
@@ -96,7 +97,7 @@ def distances(
 
 
 def first_below(distance: np.ndarray, level: float) -> np.ndarray:
-    """Samples until a distance (..., looks) first falls below a level; infinite if never."""
+    """Samples until a distance (..., evaluations) first falls below a level; infinite if it never does."""
     there = distance < level
     return np.where(there.any(axis=-1), (np.argmax(there, axis=-1) + 1) * EVERY, np.inf)
 
@@ -115,23 +116,23 @@ def _weights(filter: AdaptiveFilter, phi: Any, y: Any) -> Any:
 
 
 def paths(filter: AdaptiveFilter, phi: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Weights after every `EVERY` samples (runs, looks, P), for regressors (runs, N, P)."""
+    """Weights every `EVERY` samples (runs, evaluations, P), for regressors (runs, N, P)."""
     with double_precision():
         return np.asarray(_weights(filter, jnp.asarray(phi), jnp.asarray(y)))
 
 
 @dataclasses.dataclass(frozen=True)
 class Task:
-    """Records with the regressors of one basis and the best weights there are.
+    """Recordings with the regressors of one basis, and the best fixed weights.
 
     Attributes:
-        phi: (runs, N, P).
-        y: (runs, N), in units of the least error.
-        target: Least-squares weights of a long record (P,).
-        root: Factor `root' root` of its Gram matrix (P, P), so that `|root (w - target)|^2` is the excess of
-            the squared error, as a share of the least.
-        degrees: (P,).
-        condition: Of the Gram matrix.
+        phi: Regressors (runs, N, P).
+        y: Outputs (runs, N), divided by the root mean square error of the best weights.
+        target: Best weights: least squares on a long recording (P,).
+        root: Factor of the Gram matrix `root' root` of this recording (P, P), so that
+            `|root (w - target)|^2` is the excess squared error as a share of the least squared error.
+        degrees: Degree of each regressor (P,).
+        condition: Condition number of the Gram matrix.
     """
 
     phi: np.ndarray
@@ -151,7 +152,7 @@ class Task:
         runs: int,
         cutoff: float | None = CUTOFF,
     ) -> Task:
-        """Simulated; the first second, in which the joint starts from rest, is left out."""
+        """The task for a simulated scenario; the first second after the start from rest is left out."""
         first = round(1.0 / Ts)
         u, y = record(scenario, Ts, 60_000, cutoff, 999)
         X, y = basis.regressors(u)[first:], y[first:]

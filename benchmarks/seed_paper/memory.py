@@ -1,4 +1,4 @@
-"""2.2: how much memory a finite impulse response needs."""
+"""2.2: error of five delays, and the memory that a finite impulse response needs."""
 
 from __future__ import annotations
 
@@ -61,12 +61,12 @@ def blocks(quick: bool, say: Callable[[str], None]) -> Iterator[Block]:
 
 
 def autocovariance(N: int, Ts: float, cutoff: float | None) -> np.ndarray:
-    """Of the input at the lags from 0."""
+    """Autocovariance of the input at lags from 0."""
     return ar1(np.exp(-2 * np.pi * cutoff * Ts) if cutoff else 0.0, N)
 
 
 def wiener(h: np.ndarray, Ts: float, cutoff: float | None) -> float:
-    """NMSE of the best five delays for an impulse response."""
+    """NMSE of five delays with the Wiener solution for an impulse response."""
     return minimum_nmse(FIVE, h, autocovariance(len(h), Ts, cutoff))
 
 
@@ -76,7 +76,7 @@ def deviation(h: np.ndarray, Ts: float, cutoff: float | None) -> float:
 
 
 def shortest(share: float) -> float:
-    """Sampling interval [ms] at which five delays leave exactly a share."""
+    """Sampling interval at which the NMSE of five delays equals a share [ms]."""
 
     def excess(Ts: float) -> float:
         return minimum_nmse(FIVE, impulse_response(Ts, 50 * Ts)) - share
@@ -85,7 +85,7 @@ def shortest(share: float) -> float:
 
 
 def with_friction(quick: bool) -> Block:
-    """Least squares on simulated records."""
+    """Held-out errors of least squares on simulated recordings with friction."""
     N, records = (3000, 3) if quick else (15000, 8)
     basis = Volterra(FIVE, order=1)
     rows, spread = {}, {}

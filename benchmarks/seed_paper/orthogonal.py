@@ -1,4 +1,4 @@
-"""2.7: what orthogonal regressors are worth to LMS."""
+"""2.7: convergence of LMS with orthogonalised regressors."""
 
 from __future__ import annotations
 
@@ -33,24 +33,24 @@ def blocks(quick: bool, say: Callable[[str], None]) -> Iterator[Block]:
 
 
 def coloured(N: int, a: float, seed: int) -> np.ndarray:
-    """First-order noise of unit variance with the correlation `a` from sample to sample."""
+    """First-order noise of unit variance with correlation `a` between successive samples."""
     w = np.random.default_rng(seed).standard_normal(N)
     w[1:] *= np.sqrt(1 - a**2)
     return lfilter([1.0], [1.0, -a], w)
 
 
 def volterra() -> Volterra:
-    """Constant, five delays and their 15 products."""
+    """The raw regressors: a constant, five delays and their 15 products."""
     return Volterra(Delays(MEMORY, first=0), order=2)
 
 
 def hermite(a: float) -> Hermite:
-    """The same, made orthonormal for the coloured input."""
+    """The same regressors, made orthonormal for the coloured input."""
     return Hermite.of(volterra(), toeplitz(a ** np.arange(MEMORY)))
 
 
 def gram(quick: bool) -> Block:
-    """Gram matrices of samples."""
+    """Sample Gram matrices of the orthonormal and of the raw regressors."""
     N = 20_000 if quick else 400_000
     u = coloured(N, 0.8, 0)
     X, raw = (basis.regressors(u)[MEMORY:] for basis in (hermite(0.8), volterra()))
@@ -72,17 +72,17 @@ def gram(quick: bool) -> Block:
 
 
 def lms(setting):
-    """Step sizes of constant and linear, and of quadratic regressors."""
+    """LMS with one step size for constant and linear regressors, and one for quadratic ones."""
     return LMS(mu=jnp.where(jnp.asarray(DEGREES) == 2, setting[1], setting[0]))
 
 
 def rls(setting):
-    """No forgetting."""
+    """Recursive least squares without forgetting."""
     return RLS(lam=1.0, delta=setting[0])
 
 
 def plants(a: float, N: int, runs: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Inputs, outputs and weights of random kernels, with noise 30 dB below."""
+    """Inputs, outputs and weights of random kernels, with noise 30 dB below the output."""
     U, Y, W = [], [], []
     for seed in range(runs):
         rng = np.random.default_rng(1000 + seed)
@@ -95,7 +95,7 @@ def plants(a: float, N: int, runs: int) -> tuple[np.ndarray, np.ndarray, np.ndar
 
 
 def speed(quick: bool, say: Callable[[str], None]) -> Block:
-    """Samples to a parameter error of 10 %."""
+    """Samples until the error of the raw weights is 10 %, for LMS, orthonormalised LMS and RLS."""
     runs, limit = (3, 10_000) if quick else (9, LIMIT)
     P = len(DEGREES)
     rows = {}
@@ -153,7 +153,7 @@ def grid(a: float) -> np.ndarray:
 
 
 def quadratic(N: int, runs: int) -> Block:
-    """A plant whose quadratic kernel matters: S5s, with eight delays."""
+    """Samples to 10 % excess error for a plant with a large quadratic kernel, S5s, with eight delays."""
     Ts = 0.05
     basis = Volterra(Delays(8, first=0), order=2)
     whitened = GramSchmidt.of(basis, record("S5s", Ts, 60_000, CUTOFF, 999)[0])
@@ -188,5 +188,5 @@ def quadratic(N: int, runs: int) -> Block:
 
 
 def weighted(mu):
-    """Step sizes as they are."""
+    """LMS with a step size for each weight."""
     return LMS(mu=mu)

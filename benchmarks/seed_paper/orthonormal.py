@@ -16,10 +16,10 @@ from seed_paper.records import impulse_response, nmse, record
 
 TITLE = "Orthonormal functions"
 SECONDS = 6.0
-"""Of impulse responses: functions at a slow pole must have died out."""
+"""Length of impulse responses, enough for functions with a slow pole to decay."""
 INTERVALS = {"1 ms": 0.001, "10 ms": 0.01, "20 ms": 0.02, "50 ms": 0.05}
 FREE_FREE = complex(-1.6, 32.2)
-"""A pole of the joint without back-EMF: it has the 0.2 s of the paper, but is not the joint's [1/s]."""
+"""A pole of the joint without back-EMF [1/s]. It has the 0.2 s of the paper, but is no pole of the joint."""
 
 
 def blocks(quick: bool, say: Callable[[str], None]) -> Iterator[Block]:
@@ -71,19 +71,19 @@ def blocks(quick: bool, say: Callable[[str], None]) -> Iterator[Block]:
 
 
 def plant_poles() -> tuple[complex, ...]:
-    """Of the linear joint but for the integrator: the real one, then the pair, upper one first [1/s]."""
+    """Poles of the linear joint except the integrator [1/s]: the real one, then the pair, upper one first."""
     eigenvalues = np.linalg.eigvals(linearise(plant("S0")).A)
     chosen = [complex(p) for p in eigenvalues if abs(p) > 1e-6]
     return tuple(sorted(chosen, key=lambda p: (abs(p.imag) > 1e-9, -p.imag)))
 
 
 def coefficients(poles: tuple[complex, ...], Ts: float, h: np.ndarray) -> np.ndarray:
-    """Of an impulse response on the functions at these poles."""
+    """Coefficients of an impulse response on the functions with these poles."""
     return Orthonormal.at(poles, Ts).impulse_responses(len(h)).T @ h
 
 
 def under_friction(quick: bool, poles: tuple[complex, ...]) -> Iterator[Block]:
-    """Poles that friction moves, and what moving them gains."""
+    """Poles fitted to recordings with friction, and held-out errors with fixed and with fitted poles."""
     Ts, N, records = 0.02, *((3000, 2) if quick else (15000, 6))
     rows, spread, errors = {}, {}, []
     for scenario in ("S1", "S2"):
@@ -120,7 +120,7 @@ def under_friction(quick: bool, poles: tuple[complex, ...]) -> Iterator[Block]:
 
 
 def judged(bank: Orthonormal, train: tuple, test: tuple, Ts: float) -> float:
-    """Held-out NMSE of a linear fit."""
+    """NMSE of a linear fit on a second recording."""
     recordings = [Recording(u=u, y=y, Ts=Ts, channels="alpha") for u, y in (train, test)]
     fit = least_squares(Volterra(bank, order=1), recordings[0], "alpha")
     return nmse(test[1], fit.model.simulate(recordings[1])[:, 0])

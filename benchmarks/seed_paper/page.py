@@ -1,4 +1,4 @@
-"""The tables as Markdown."""
+"""Results of B2 as Markdown."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import Any
 
 
 def text(x: Any) -> str:
-    """A number to four digits, the rest in words."""
+    """A number to four digits; an interval as its two ends, None as "never"."""
     if x is None:
         return "never"
     if isinstance(x, list):
@@ -17,7 +17,7 @@ def text(x: Any) -> str:
 
 
 def cell(c: dict[str, Any]) -> str:
-    """Ours, and the reference in brackets; a star where they differ beyond the tolerance."""
+    """The value with the reference in brackets, and a star if they differ by more than the tolerance."""
     if not c:
         return "-"
     ours = text(c["value"])
@@ -27,7 +27,7 @@ def cell(c: dict[str, Any]) -> str:
 
 
 def tolerance(block: dict[str, Any]) -> str:
-    """In words."""
+    """Text of the tolerances of a part."""
     t = block["tolerance"]
     parts = []
     if t["relative"]:
@@ -40,7 +40,7 @@ def tolerance(block: dict[str, Any]) -> str:
 
 
 def block_text(block: dict[str, Any]) -> str:
-    """One part of a table."""
+    """Text of one part of a table."""
     lines = [f"### {block['title']}", "", block["about"], ""]
     lines.append("| | " + " | ".join(block["columns"]) + " |")
     lines.append("|---|" + "---|" * len(block["columns"]))
@@ -55,7 +55,7 @@ def block_text(block: dict[str, Any]) -> str:
 
 
 def matters(name: str, block: dict[str, Any]) -> bool:
-    """Whether a note speaks of a number that differs."""
+    """Whether a note concerns a number that differs by more than the tolerance."""
     return any(name in ("", b, *b.split(" | ")) for b in block["beyond"])
 
 

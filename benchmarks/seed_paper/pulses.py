@@ -1,4 +1,4 @@
-"""3: the pulse of 2 V and 1 s, which no model has seen."""
+"""3: response to a pulse of 2 V and 1 s, by models that were not fitted to it."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ def blocks(quick: bool, say: Callable[[str], None]) -> Iterator[Block]:
 
 
 def pulse(Ts: float) -> np.ndarray:
-    """Rest, two volts, rest [V]."""
+    """Voltage: zero, 2 V for a second, zero [V]."""
     return np.repeat([0.0, 2.0, 0.0], [round(t / Ts) for t in (REST, WIDTH, AFTER)])
 
 
 def answer(scenario: str, Ts: float, step: float = 1e-4) -> np.ndarray:
-    """Angle and deflection (N, 2) [rad]."""
+    """Hub angle and deflection of a scenario after the pulse (N, 2) [rad]."""
     return response(plant(scenario), pulse(Ts), Ts, step=step)
 
 
@@ -57,7 +57,7 @@ def truth() -> Block:
 
 
 def in_short() -> Block:
-    """Peaks, and the linear model beside them."""
+    """Peaks of the response of S1, compared with those of the linear model."""
     Ts = 1e-3
     y, linear = (answer(s, Ts) for s in ("S1", "S0"))
     end = round((REST + WIDTH) / Ts)
@@ -80,13 +80,13 @@ def in_short() -> Block:
 
 
 def adapted(scenario: str, Ts: float, N: int, seed: int) -> Orthonormal:
-    """Three functions with poles fitted to a record of the scenario."""
+    """Three orthonormal functions with poles fitted to a recording of the scenario."""
     u, y = record(scenario, Ts, N, CUTOFF, seed)
     return optimise_poles(u, y, Orthonormal.at(plant_poles(), Ts).poles)[0]
 
 
 def orders(bank: Orthonormal, scenario: str, Ts: float, N: int, seed: int) -> dict[str, np.ndarray]:
-    """Answers of the series on a bank, up to the third degree."""
+    """Pulse responses of Volterra series on a bank, of degrees 1 to 3."""
     u, y = record(scenario, Ts, N, CUTOFF, seed)
     return {
         f"3 functions, degree {order}": by_least_squares(Volterra(bank, order=order), u, y, pulse(Ts))
@@ -95,7 +95,7 @@ def orders(bank: Orthonormal, scenario: str, Ts: float, N: int, seed: int) -> di
 
 
 def models(scenario: str, Ts: float, N: int, seed: int) -> dict[str, np.ndarray]:
-    """Answers of all models to the pulse, by name."""
+    """Pulse responses of all models, by name."""
     u, y = record(scenario, Ts, N, CUTOFF, seed)
     v = pulse(Ts)
     five = Delays(5, first=0)
@@ -111,18 +111,18 @@ def models(scenario: str, Ts: float, N: int, seed: int) -> dict[str, np.ndarray]
 
 
 def by_least_squares(basis: Volterra, u: np.ndarray, y: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Answer to `v` of the series fitted to `u` and `y`."""
+    """Response to `v` of a Volterra series fitted to `u` and `y`."""
     return basis.regressors(v) @ np.linalg.lstsq(basis.regressors(u), y, rcond=None)[0]
 
 
 def errors(scenario: str, Ts: float, answers: dict[str, np.ndarray]) -> list[float]:
-    """NMSE of every answer."""
+    """NMSE of each pulse response."""
     y = answer(scenario, Ts)[:, 1]
     return [nmse(y, y_hat) for y_hat in answers.values()]
 
 
 def symmetric(N: int, records: int, about: str, say: Callable[[str], None]) -> Block:
-    """S1 at four sampling intervals."""
+    """Errors of all models for S1 at four sampling intervals."""
     columns, means, spreads, names = ("1 ms", "10 ms", "50 ms", "100 ms"), [], [], []
     for name in columns:
         say(f"S1, {name}")
@@ -147,7 +147,7 @@ def symmetric(N: int, records: int, about: str, say: Callable[[str], None]) -> B
 
 
 def ringing(N: int, records: int) -> Block:
-    """How much of the error three functions make after the pulse, when the hub sticks."""
+    """Share of the squared error of three functions that occurs after the pulse, while the hub sticks."""
     shares = []
     y = answer("S1", 0.01)[:, 1]
     after = round((REST + 1.2) / 0.01)
@@ -168,7 +168,7 @@ def ringing(N: int, records: int) -> Block:
 
 
 def others(N: int, records: int, about: str, say: Callable[[str], None]) -> Block:
-    """A one-sided dead zone and unlike springs, 100 ms."""
+    """Errors for a one-sided dead zone (S4) and two different springs (S5p), with 100 ms sampling."""
     rows, spreads = {}, {}
     for scenario in ("S4", "S5p"):
         say(scenario)

@@ -1,4 +1,4 @@
-"""Inputs, and what the scenarios answer to them."""
+"""Inputs and simulated responses of the scenarios."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from rotflex_jax.data.excitation import noise
 from rotflex_jax.reproduce.plants import plant, response
 
 STEP = 1e-3
-"""Longest step of the simulation [s]; the deflection then errs by less than 1e-8 (NMSE)."""
+"""Longest step of the simulation [s]; the NMSE of the deflection is then below 1e-8."""
 
 
 def white(N: int, seed: int) -> np.ndarray:
@@ -19,7 +19,7 @@ def white(N: int, seed: int) -> np.ndarray:
 
 
 def voltage(N: int, Ts: float, cutoff: float | None, seed: int) -> np.ndarray:
-    """First-order noise of unit variance, white without a cutoff [V]."""
+    """First-order noise of unit variance; white if `cutoff` is None [V]."""
     return noise(N, Ts, bandwidth=cutoff, seed=seed) if cutoff else white(N, seed)
 
 
@@ -27,7 +27,7 @@ def voltage(N: int, Ts: float, cutoff: float | None, seed: int) -> np.ndarray:
 def record(
     scenario: str, Ts: float, N: int, cutoff: float | None, seed: int, step: float = STEP
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Voltage and deflection (N,)."""
+    """Voltage [V] and deflection [rad] of a scenario (N,)."""
     u = voltage(N, Ts, cutoff, seed)
     y = deflection(scenario, u, Ts, step)
     u.flags.writeable = y.flags.writeable = False
@@ -35,15 +35,15 @@ def record(
 
 
 def deflection(scenario: str, u: np.ndarray, Ts: float, step: float = STEP) -> np.ndarray:
-    """What the plant answers, from rest [rad]."""
+    """Deflection of a scenario that starts at rest [rad]."""
     return np.array(response(plant(scenario), u, Ts, step=step)[:, 1])
 
 
 def impulse_response(Ts: float, seconds: float = 2.0, scenario: str = "S0") -> np.ndarray:
-    """Of the deflection to one held volt; exact for the linear plant."""
+    """Response of the deflection to 1 V for one sample [rad]; exact for the linear plant."""
     return deflection(scenario, np.eye(1, round(seconds / Ts))[0], Ts)
 
 
 def nmse(y: np.ndarray, y_hat: np.ndarray) -> float:
-    """Squared error over the variance of what was measured."""
+    """Mean squared error over the variance of the measurement."""
     return float(np.sum((y - y_hat) ** 2) / np.sum((y - np.mean(y)) ** 2))

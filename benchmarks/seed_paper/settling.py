@@ -1,4 +1,4 @@
-"""2.6, second part: when the weights of LMS settle."""
+"""2.6, second part: settling times of the weights of LMS, by theory and by simulation."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ MU1 = 0.01
 
 
 def moments(a: float, *degrees: int) -> Moments:
-    """Of five delays of first-order noise."""
+    """Moments of the regressors of these degrees, for five delays of first-order noise."""
     return Moments.gaussian(ar1_covariance(a, MEMORY), degrees)
 
 
 def power_of_ten(x: float) -> str:
-    """As 4.3e-4."""
+    """A number in a form such as 4.3e-4."""
     return f"{x:.1e}".replace(".0", "").replace("e-0", "e-")
 
 
 def theory() -> Block:
-    """ln 20 over eigenvalue and samples."""
+    """Step sizes by the theory of the mean: ln 20 / (eigenvalue times samples)."""
     rows = {
         "mu = 1, products of unlike lags": (settling_step_size(1, ITERATIONS),),
         "mu = 2, differences of squares": (settling_step_size(2, ITERATIONS),),
@@ -46,12 +46,12 @@ def theory() -> Block:
 
 
 def unlike_products(basis: Volterra) -> np.ndarray:
-    """Which weights belong to products of two different delays."""
+    """Mask of the weights of products of two different delays."""
     return np.array([len(i) == 2 and i[0] != i[1] for i in basis.indices])
 
 
 def measured(quick: bool) -> Block:
-    """Mean course of the largest coefficient of a product of unlike lags."""
+    """Settling time of the largest coefficient of a product of different lags, from its mean over runs."""
     runs = 4 if quick else 32
     basis = Volterra(Delays(MEMORY, first=0), order=2)
     cases = {2.1e-4: 25_000, 4.3e-4: 12_000, 1e-3: 6_000, 3e-3: 2_000}
@@ -89,13 +89,13 @@ def measured(quick: bool) -> Block:
 
 
 def crossing(path: np.ndarray, share: float) -> float | None:
-    """Samples until a course first reaches a share of its end."""
+    """Samples until a weight, as a share of its best value, first reaches `share`; None if it never does."""
     there = path >= share
     return float(EVERY * (np.argmax(there) + 1)) if there.any() else None
 
 
 def of_s6(N: int, records: int) -> Block:
-    """Theory of the mean, for the largest quadratic coefficient of S6."""
+    """Step size with which the largest quadratic coefficient of S6 settles, by the theory of the mean."""
     basis = Volterra(Delays(MEMORY, first=0), order=2)
     quadratic = basis.degrees == 2
     direction = np.where(quadratic, 1e-4, MU1)

@@ -1,4 +1,4 @@
-"""2.6: how large the step sizes of LMS may be, what they cost, and when the weights settle."""
+"""2.6: step sizes of LMS: bounds of stability, misadjustment and settling."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def blocks(quick: bool, say: Callable[[str], None]) -> Iterator[Block]:
 
 
 def bounds() -> Block:
-    """Mean-square bounds."""
+    """Bounds of the mean square for five correlations of the input."""
     rows = {}
     for a in (0.0, 0.2846, 0.5335, 0.7304, 0.9391):
         rule = 2 / (3 * np.trace(moments(a, 2).R))
@@ -55,7 +55,7 @@ def bounds() -> Block:
 
 
 def mean_bounds() -> Block:
-    """Bounds of the mean."""
+    """Bounds of the mean, white input."""
     rows = {name: (mean_bound(moments(0.0, d)),) for name, d in (("linear", 1), ("quadratic", 2))}
     return Block(
         "Largest stable step size of the mean, white input",
@@ -67,12 +67,12 @@ def mean_bounds() -> Block:
 
 
 def lms(mu):
-    """Step sizes as they are."""
+    """LMS with a step size for each weight."""
     return LMS(mu=mu)
 
 
 def plain() -> Volterra:
-    """Five delays and their products, no constant."""
+    """Five delays and their products, without a constant."""
     return Volterra(Delays(MEMORY, first=0), order=2, constant=False)
 
 
@@ -95,7 +95,7 @@ def excess(plant: str, pairs: list[tuple[float, float]], N: int, runs: int) -> n
 
 
 def delay_line(N: int, runs: int, say: Callable[[str], None]) -> Block:
-    """Step sizes that theory allows and a delay line does not."""
+    """Misadjustment on a real delay line, at step sizes that independence theory allows."""
     pairs = [(0.01, 0.003), (0.01, 0.01), (0.01, 0.02), (0.1, 0.001), (0.2, 0.001)]
     found = {}
     for plant in ("noise", "S6", "S5s"):
@@ -124,7 +124,7 @@ def delay_line(N: int, runs: int, say: Callable[[str], None]) -> Block:
 
 
 def misadjustment(N: int, runs: int) -> Block:
-    """Half of the sum of step sizes and powers, and what comes out."""
+    """Misadjustment by theory and as measured; the simple rule is half the sum of step size times power."""
     pairs = [(MU1, mu2) for mu2 in (1e-4, 4.3e-4, 1e-3, 3e-3)]
     noise, joint = (excess(plant, pairs, N, runs) for plant in ("noise", "S6"))
     both, degrees = moments(0.0, 1, 2), plain().degrees

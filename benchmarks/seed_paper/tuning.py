@@ -1,4 +1,4 @@
-"""4: step sizes by the gradient through the loop of LMS, by a grid, and by theory."""
+"""4: step sizes tuned by the gradient through the recursion of LMS, by a grid, and by theory."""
 
 from __future__ import annotations
 
@@ -90,17 +90,17 @@ def blocks(quick: bool, say: Callable[[str], None]) -> Iterator[Block]:
 
 
 def axes(points: int) -> dict[str, np.ndarray]:
-    """Step sizes to try."""
+    """Step sizes of the grid."""
     return {"mu1": np.geomspace(1e-3, 0.1, points), "mu2": np.geomspace(5e-5, 5e-3, points)}
 
 
 def build(settings: dict) -> LMS:
-    """LMS with a step size for linear weights, and one for the quadratic ones."""
+    """LMS with one step size for linear weights and one for quadratic ones."""
     return LMS(mu=BASIS.step_sizes({1: settings["mu1"], 2: settings["mu2"]}))
 
 
 def recordings(seeds: range, N: int) -> list[Recording]:
-    """Of S6 with sensor noise."""
+    """Recordings of S6 with sensor noise."""
     made = []
     for seed in seeds:
         u, y = record("S6", Ts, N + 10, CUTOFF, seed)
@@ -110,7 +110,7 @@ def recordings(seeds: range, N: int) -> list[Recording]:
 
 
 def largest_difference(train: list[Recording], objective: str) -> float:
-    """Relative, over both slopes at one point."""
+    """Largest error of the two derivatives at one point, relative to the larger central difference."""
     curve = RangeTransform(("mu1", "mu2"), ((0.0, np.inf),) * 2)
     x, h = np.log([0.01, 3e-4]), 1e-5
     points = np.array([x, *(x + s * h * np.eye(2)[k] for k in range(2) for s in (1, -1))])

@@ -1,1 +1,1 @@
-"""Hobby servos: the extended friction models fitted by evolution, beside a grey-box model of the firmware."""
+"""B10: extended friction models fitted by CMA-ES, and grey-box models of the firmware, of hobby servos."""

@@ -1,4 +1,4 @@
-"""Joints of the SO-101: the same model, whose gain and motor nobody has written down."""
+"""Joints of the SO-101: the models of the XL-330, with unknown gain and motor parameters."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from servo.evolved import Box, evolved_alike, evolved_models
 from servo.friction_models import Logs
 from servo.grey_box import of_the_package
 
-# Learnt from these motions, evaluated on the other one, of joints that carry little.
+# Motions for the fit, motion for the evaluation, and joints, which carry little weight.
 TRAIN, TEST = ("multisine", "chirp_sweep"), "step_response"
 JOINTS = ("Rotation", "Elbow", "Wrist_Pitch", "Wrist_Roll")
 
 INERTIA, SUPPLY = 0.03, 7.4
 SUBSTEPS = 4
-"""Steps of one sample of 20 ms."""
+"""Integration steps per sample of 20 ms."""
 
-# What the models M1 to M6 need here beside friction; the arm's weight at this joint is unknown too.
+# Bounds of the parameters of M1 to M6 beside friction. The weight of the arm at the joint is unknown too.
 ARM_BOX: Box = {"slope": (0.5, 12.0), "load": (0.0, 2.0)}
 ARM_MOTOR: Box = {
     "kt": (0.1, 5.0),
@@ -35,7 +35,7 @@ ARM_MOTOR: Box = {
     "q_offset": (-np.pi, np.pi),
     "base": (0.0, 0.5),
 }
-# The box of an evolution over the numbers of the grey box.
+# Bounds of the parameters of the grey box for CMA-ES.
 GREY_BOX: Box = {
     "hub.position_servo.gain": (3.0, 72.0),
     "hub.position_servo.torque_constant": (0.1, 5.0),
@@ -50,12 +50,12 @@ STRUCTURES: dict[str, tuple[fx.Effect, ...]] = {
     "no friction": (),
     "Coulomb": (fx.Coulomb("hub", level=0.05),),
 }
-# Fitted without the fast end of the chirp, where every model is away by a multiple of what it is elsewhere.
+# A fit without the fast end of the chirp, where the error of every model is several times that elsewhere.
 SLOW, SLOW_SAMPLES = "Coulomb, slow", 4000
-# The parameters of M1 from the preset alone, fitted to all of both motions: by absolute errors but for the
-# smallest, as M1 to M6 are; over windows, whose cost has fewer local minima than that of whole runs; and with
-# so few steps in each of the four minimisations of a robust fit that they take less than a fiftieth of the
-# runs of an evolution.
+# A model with the same parameters as M1, fitted from the preset alone to all of both motions. The fit is
+# robust (all but the smallest errors count by their absolute values, as for M1 to M6) and uses windows, whose
+# cost has fewer local minima than that of whole runs. The steps in each of the four minimisations of a robust
+# fit are so few that they need less than a fiftieth of the free runs of CMA-ES.
 LIKE_M1 = "parameters of M1"
 LIKE_M1_EFFECTS = (
     fx.Coulomb("hub", level=0.05),
@@ -67,7 +67,7 @@ EVOLVED = "Coulomb, delay, CMA-ES"
 
 
 def logs(recordings: list[rf.Recording]) -> Logs:
-    """The recordings as the extended friction models take them, `SUBSTEPS` steps a sample, goals held."""
+    """Recordings for the extended friction models: `SUBSTEPS` steps per sample, with a constant goal."""
     N = max(r.N for r in recordings) * SUBSTEPS
     pad = lambda x: np.pad(np.repeat(x, SUBSTEPS), (0, N - SUBSTEPS * len(x)))  # noqa: E731
     slopes = [np.polyfit(np.arange(r.n_init) * r.Ts, r.y[: r.n_init, 0], 1)[0] for r in recordings]
@@ -86,9 +86,9 @@ def logs(recordings: list[rf.Recording]) -> Logs:
 
 
 def starts() -> list[rf.Mechanism]:
-    """Where a fit begins: a strong motor and a weak one of equal stiffness and damping.
+    """Starts of a fit: a strong motor, and a weak one with equal stiffness and damping.
 
-    Where the duty of the start never reaches its limit, no slope shows the largest torque.
+    If the duty never reaches its limit at a start, the derivatives there do not depend on the largest torque.
     """
     servo = rf.joints.sts3215(INERTIA, gain=16.0, supply=SUPPLY).release("hub.position_servo.gain")
     motor = servo.effect("position_servo", "hub").values
@@ -98,7 +98,7 @@ def starts() -> list[rf.Mechanism]:
 
 
 def with_effects(servo: rf.Mechanism, effects: Sequence[fx.Effect]) -> rf.Model:
-    """The servo with effects, several steps a sample."""
+    """The servo with effects added, and several integration steps per sample."""
     for effect in effects:
         servo = servo + effect
     return rf.Model(servo, rf.Exponential(substeps=SUBSTEPS))
@@ -107,7 +107,7 @@ def with_effects(servo: rf.Mechanism, effects: Sequence[fx.Effect]) -> rf.Model:
 def fitted(
     models: Sequence[rf.Model], train: Sequence[rf.Recording], **how: Any
 ) -> tuple[rf.Fit, dict[str, Any]]:
-    """The fit of the least cost from several starts, and what all of them took."""
+    """The fit with the least cost from several starts, and its row with the time and runs of all of them."""
     began, processor = time.perf_counter(), time.process_time()
     fits = [rf.fit(model, train, **how) for model in models]
     best = min(fits, key=lambda f: f.cost)
@@ -121,7 +121,7 @@ def fitted(
 
 
 def _effects(name: str) -> tuple[fx.Effect, ...]:
-    """What a row of the grey box has beside the servo."""
+    """Effects that a row of the grey box adds to the servo."""
     special = {LIKE_M1: LIKE_M1_EFFECTS, EVOLVED: (*STRUCTURES["Coulomb"], fx.Delay(time=0.01))}
     return special.get(name) or STRUCTURES["Coulomb" if name == SLOW else name]
 
@@ -135,9 +135,9 @@ def _run(parameters: dict[str, Any], name: str, recording: rf.Recording) -> np.n
     """A free run over a recording [rad].
 
     Args:
-        parameters: That were found; of the grey box with their deviations.
-        name: Of the model.
-        recording: Of the motion.
+        parameters: Fitted parameters; those of a fit by `rf.fit` are pairs of value and standard deviation.
+        name: Name of the model.
+        recording: Recording of a motion.
     """
     if name in friction_models.MODELS:
         run = friction_models.rollouts(parameters, logs([recording]))[0]
@@ -150,15 +150,16 @@ def _run(parameters: dict[str, Any], name: str, recording: rf.Recording) -> np.n
 def joint_row(
     joint: str, rollouts: int, row: dict[str, Any] | None, search: bool, code: str
 ) -> dict[str, Any]:
-    """Errors [deg] of free runs of one joint over motions that no fit has seen.
+    """Errors of free runs of one joint over motions that no fit used [deg].
 
     Args:
         joint: Name of the joint.
-        rollouts: Free runs of all training recordings together at most, of each evolution.
-        row: What is known already, which is kept; None for nothing.
-        search: Whether it is searched, too: from the servo without friction, `multisine` to learn from and
-            `step_response` to validate on.
-        code: What later rows are of.
+        rollouts: Largest number of cost evaluations of each evolution, each with a free run of every training
+            recording.
+        row: Results from before, which are kept; None if there are none.
+        search: Whether `rf.discover` is run too. It starts from the servo without friction, with `multisine`
+            as training and `step_response` as validation data.
+        code: Digest of the code, stored with new results.
     """
     recordings = rf.data.load_dataset("so101")
     of = {r.source.split(",")[0]: r for r in recordings if f" {joint}," in r.source}
@@ -220,16 +221,16 @@ def arm(
     search: Sequence[str] = (),
     workers: int = 1,
 ) -> None:
-    """One row per joint, as `joint_row` has it.
+    """Computes one row per joint by `joint_row`.
 
     Args:
         say: Called with a line for each joint.
-        rollouts: Free runs of all training recordings together at most, of each evolution.
-        rows: Filled up; what is there already is kept.
-        keep: Called where something was added.
-        code: What new rows are of.
-        search: Joints that are searched, too.
-        workers: Processes that share the joints.
+        rollouts: As for `joint_row`.
+        rows: Earlier rows, completed in place.
+        keep: Called after each joint, to store the rows.
+        code: Digest of the code, stored with new results.
+        search: Joints for which `rf.discover` is run too.
+        workers: Number of processes among which the joints are divided.
     """
     known = {r["joint"]: r for r in rows}
     with ProcessPoolExecutor(min(workers, len(JOINTS)), multiprocessing.get_context("spawn")) as pool:

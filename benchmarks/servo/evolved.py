@@ -1,6 +1,7 @@
-"""Servos fitted by evolution: the extended friction models as their authors do, and the grey box itself.
+"""Servos fitted by CMA-ES: the extended friction models, as their authors fit them, and the grey box.
 
-The second is what PACE does for robots: CMA-ES over the numbers of one model, on errors of free runs.
+The second corresponds to PACE, which fits the parameters of one model of a robot by CMA-ES to errors of free
+runs.
 
 Source: F. Bjelonic, F. Tischhauser, M. Hutter, Towards bridging the gap: systematic sim-to-real transfer for
 diverse legged robots, 2025, arXiv 2509.06342 (PACE).
@@ -27,18 +28,18 @@ from servo.recordings import Split, errors, logs
 Box = dict[str, tuple[float, float]]
 """Name -> least and largest value."""
 
-# Points that are run side by side.
+# Number of parameter sets that are simulated at once.
 _LANES = 16
 
 
 def evolved(name: str, split: Split, rollouts: int, seed: int) -> dict[str, Any]:
-    """One of M1 to M6: the least mean absolute error of free runs, and its row of the results.
+    """Fits one of M1 to M6 by the mean absolute error of free runs, and returns its row of the results.
 
     Args:
-        name: Of the model.
-        split: What is learnt from.
-        rollouts: Free runs of all training recordings together at most.
-        seed: Of the evolution.
+        name: Name of the model.
+        split: Training and test recordings.
+        rollouts: Largest number of cost evaluations, each with a free run of every training recording.
+        seed: Seed of the evolution.
     """
     row = _of_model(friction_models.MODELS[name], logs(split.train), rollouts, seed)
     runs = lambda of: list(friction_models.rollouts(row["parameters"], logs(of)))  # noqa: E731
@@ -49,13 +50,14 @@ def evolved(name: str, split: Split, rollouts: int, seed: int) -> dict[str, Any]
 
 
 def evolved_models(train: Logs, rollouts: int, more: Box, other: Box) -> dict[str, dict[str, Any]]:
-    """M1 to M6 where gain and weight are unknown too.
+    """Fits M1 to M6 with unknown gain and weight.
 
     Args:
-        train: Learnt from; its `slope` and `load` are replaced.
-        rollouts: Free runs of all training recordings together at most, of each.
-        more: Box of `slope` [1/rad] and `load` [N m].
-        other: Boxes in the place of those of an XL-330; a parameter whose box is empty is zero.
+        train: Training recordings; their `slope` and `load` are not used.
+        rollouts: Largest number of cost evaluations for each model, each with a free run of every training
+            recording.
+        more: Bounds of `slope` [1/rad] and `load` [N m].
+        other: Bounds that replace those of an XL-330; a parameter with equal bounds is not fitted but zero.
     """
     found = {}
     for name, box in friction_models.MODELS.items():
@@ -82,19 +84,19 @@ def _of_model(box: Box, train: Logs, rollouts: int, seed: int) -> dict[str, Any]
 def evolved_alike(
     mechanism: rf.Mechanism | rf.Model, train: Sequence[rf.Recording], box: Box, rollouts: int, seed: int
 ) -> tuple[rf.Model, dict[str, Any]]:
-    """The numbers of the grey box by CMA-ES: the least sum of squares of free runs, as its fit has it.
+    """Fits the grey box by CMA-ES to the sum of squared free-run errors, which `rf.fit` also minimises.
 
     First positions and speeds are those of the measured angles.
 
     Args:
-        mechanism: Whose free parameters are found.
-        train: Learnt from.
-        box: Of the free parameters; those without one are left as they are.
-        rollouts: Free runs of all training recordings together at most.
-        seed: Of the evolution.
+        mechanism: Mechanism or model whose free parameters are fitted.
+        train: Training recordings.
+        box: Bounds of the free parameters; a parameter without bounds keeps its value.
+        rollouts: Largest number of cost evaluations, each with a free run of every training recording.
+        seed: Seed of the evolution.
 
     Returns:
-        The model, and what it took.
+        The model, and a row with parameters, time and number of free runs.
     """
     model = rf.Model.of(mechanism)
     names = [n for n in model.mechanism.free_names if n in box]
@@ -115,7 +117,7 @@ def evolved_alike(
 def _squares(
     model: rf.Model, names: Sequence[str], train: Sequence[rf.Recording]
 ) -> Callable[[np.ndarray], np.ndarray]:
-    """Sums of squares of many points over all recordings, each with its own constants."""
+    """Cost function of many points: sum of squares over all recordings, each with its own constants."""
     mechanism = model.mechanism
     place = np.array([mechanism.parameter_names.index(n) for n in names])
     N = max(r.N for r in train)

@@ -1,4 +1,4 @@
-"""Errors of the servo's models over what was left out, against the free runs that their numbers took."""
+"""Figure: errors of the servo models on recordings that were left out, by number of free runs of the fit."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ GREY = {
     "motor friction, delay, robust": "motor friction, robust",
     "weight friction, delay, a supply that gives way": "with a supply that gives way",
 }
-# The last one has the numbers of "with delay".
+# The last one has the same parameters as "with delay".
 EVOLVED = {**{name: name for name in MODELS}, "weight friction, delay, CMA-ES": "CMA-ES"}
 
 
 def apart(heights: list[float], gap: float) -> list[float]:
-    """Heights of labels beside points in rising order, at least a gap apart."""
+    """Heights of labels for points in rising order, at least a gap apart."""
     found: list[float] = []
     for height in heights:
         found.append(max(height, found[-1] + gap) if found else height)
@@ -35,8 +35,8 @@ def draw(summary: dict[str, dict[str, float]], path: Path) -> None:
     """Writes the figure.
 
     Args:
-        summary: What each model has over all that was left out.
-        path: Of the PNG file.
+        summary: Errors and free runs of each model, from `page.summary`.
+        path: Path of the PNG file.
     """
     figure = blank(8.2, 3.8)
     axes = figure.subplots(1, 2, sharey=True)

@@ -1,6 +1,7 @@
 """The extended friction models M1 to M6 of servo actuators, and their simulator at the control period.
 
-The machine is a pendulum on a voltage-controlled motor, with the angle q from the lowest point:
+The machine is a pendulum on a voltage-controlled motor, with the angle q from the lowest point and the goal
+delayed by `command_delay`:
 
     control = supply clip(kp error_gain (goal - q), -1, 1)                            firmware
     motor   = kt / R (control - kt q'),    load = -m g l sin(q + q_offset)
@@ -19,9 +20,10 @@ The friction level, with s = exp(-|q' / speed|^exponent), which is 1 at rest and
     M6  M5 + s (external_quadratic load^2 where |load| < |motor|,
                 driven_quadratic motor^2 where |load| > |motor|), only where the two oppose each other
 
-so that M5 and M6 know whether the motor drives the load or the load the motor. Steps are those of the
-authors' simulator: explicit, with friction limited to what stops the motion, one step per sample. The
-directional and quadratic terms and the exponent, which the article fixes in part, are as in their program.
+In M5 and M6 friction depends on whether the motor drives the load or the load drives the motor. Steps are
+those of the authors' simulator: explicit, one per sample, with friction limited to the torque that stops the
+motion. The article specifies the directional and quadratic terms and the exponent only in part; here they are
+as in the authors' program.
 
 Source: Duclusaud, Passault, Padois, Ly 2024, Extended friction models for the physics simulation of servo
 actuators, arXiv 2410.08650, section III; bounds and simulator as published with it (Rhoban, bam, 2026).
@@ -62,24 +64,24 @@ MODELS: dict[str, dict[str, tuple[float, float]]] = {
 }
 # All parameters, in the order in which the compiled simulator takes them.
 ORDER = (*MOTOR, *STRIBECK, *LOAD, "load_stribeck", *DIRECTIONAL, *DIRECTIONAL_STRIBECK, *QUADRATIC)
-# Where a model has no Stribeck term, its shape must still be a number.
+# Values of parameters that a model lacks. Without a Stribeck term, its shape must still be finite.
 NEUTRAL = dict.fromkeys(ORDER, 0.0) | {"speed": 1.0, "exponent": 1.0}
 
 
 @dataclasses.dataclass(frozen=True)
 class Logs:
-    """Recordings side by side, as the simulator takes them; shorter ones are padded and not counted.
+    """Recordings as arrays for the simulator; the padding of shorter ones does not count.
 
     Attributes:
         goal: Goal angle (R, N) [rad].
         angle: Measured angle (R, N) [rad].
-        length: Samples of each.
-        slope: Duty per angle, kp times the error gain, of each [1/rad].
-        supply: Of each [V].
+        length: Number of samples of each recording (R,).
+        slope: Duty per angle error, kp times the error gain (R,) [1/rad].
+        supply: Supply voltage (R,) [V].
         start: First angle and speed (R, 2) [rad, rad/s].
-        Ts: Sampling period [s].
-        load: Weight of the pendulum at the horizontal, m g l [N m].
-        inertia: Of the pendulum, m l^2 [kg m^2].
+        Ts: Period of a simulation step [s].
+        load: Torque of the weight with the pendulum horizontal, m g l [N m].
+        inertia: Inertia of the pendulum, m l^2 [kg m^2].
     """
 
     goal: np.ndarray
@@ -94,7 +96,7 @@ class Logs:
 
 
 def _arguments(values: dict[str, float], logs: Logs) -> tuple[Any, ...]:
-    """What the compiled simulator takes; gain and weight are the logs' unless they are among the values."""
+    """Arguments of the compiled simulator; gain and weight are those of the logs unless `values` has them."""
     slope = np.full_like(logs.slope, values["slope"]) if "slope" in values else logs.slope
     own = dataclasses.replace(logs, slope=slope, load=values.get("load", logs.load))
     arrays = tuple(getattr(own, f.name) for f in dataclasses.fields(own))
@@ -102,7 +104,7 @@ def _arguments(values: dict[str, float], logs: Logs) -> tuple[Any, ...]:
 
 
 def flat(values: dict[str, float]) -> np.ndarray:
-    """Parameters in the order of the compiled simulator; absent ones do nothing."""
+    """Parameters in the order of the compiled simulator, with values without effect for absent ones."""
     return np.array([(NEUTRAL | values)[name] for name in ORDER])
 
 
@@ -112,7 +114,7 @@ def rollouts(values: dict[str, float], logs: Logs) -> np.ndarray:
 
 
 def mean_error(values: dict[str, float], logs: Logs) -> float:
-    """Mean absolute error of the angle, averaged over recordings [rad], which the authors minimise."""
+    """Mean absolute error of the angle, averaged over recordings [rad]: the cost of the authors."""
     return float(_mean_error(*_arguments(values, logs)))
 
 

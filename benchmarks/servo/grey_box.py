@@ -1,4 +1,4 @@
-"""The grey box: the ready-made servo with friction, fitted by free runs, and the structure a search finds."""
+"""The grey box: the ready-made servo with friction, fitted by free runs, and structures found by a search."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ from servo.recordings import LENGTH, MASS, Split, errors
 @register
 @dataclasses.dataclass(frozen=True)
 class WeightFriction(DryFriction):
-    """Friction of a gear that grows with the weight it carries. |tau| = level |sin(position)|
+    """Friction of a gear in proportion to the weight that it carries. |tau| = level |sin(position)|
 
-    An effect of one's own, as CONTRIBUTING shows it: M3 with the load alone. The motor's share of the
-    load follows the weight except while it accelerates.
+    A custom effect, made as CONTRIBUTING describes: the friction of M3 with the load alone, without the motor
+    torque. Except during acceleration, the motor torque is in proportion to the weight.
     """
 
     name: ClassVar[str] = "weight_friction"
@@ -54,9 +54,9 @@ class WeightFriction(DryFriction):
 @register
 @dataclasses.dataclass(frozen=True)
 class LiftingFriction(DryFriction):
-    """What friction is more while the weight is lifted. |tau| = level max(0, direction sin(position))
+    """Excess of friction while the weight is lifted. |tau| = level max(0, direction sin(position))
 
-    Beside `WeightFriction` it is the directional term of M5.
+    Together with `WeightFriction` it corresponds to the directional term of M5.
     """
 
     name: ClassVar[str] = "lifting_friction"
@@ -93,20 +93,20 @@ FRICTION: dict[str, tuple[fx.Effect, ...]] = {
     "motor friction, delay": (fx.LoadFriction("hub", tied=True, of="motor"), fx.Delay(time=0.005)),
     "weight friction, Stribeck": (WeightFriction("hub"), fx.Stribeck("hub", level=0.003, excess=0.01)),
 }
-"""Structures that are fitted in every case, beside the one that a search finds."""
+"""Structures that are fitted in every case, in addition to the one that a search finds."""
 
 ROBUST = "motor friction, delay, robust"
-"""Friction in proportion to the motor's torque, which the runs without torque ask for, fitted to absolute
-errors but for the smallest, as M1 to M6 are."""
+"""Friction in proportion to the motor torque, as the runs without torque indicate. It is fitted to absolute
+errors, except for the smallest ones, as M1 to M6 are."""
 
 ABSOLUTE = 0.3
 """Standard deviations beyond which an error counts by its size in `ROBUST`."""
 
 YIELDING = "weight friction, delay, a supply that gives way"
-"""The same with a resistance before the bridge, found beside the others: a loss at large duty and current."""
+"""`ALIKE` with a fitted resistance of the supply, which causes a loss at large duty and current."""
 
 ALIKE = "weight friction, delay"
-"""The one whose numbers are found by evolution too."""
+"""Structure whose parameters are also fitted by CMA-ES."""
 
 BOX = {
     "hub.inertia.inertia": (0.0050, 0.0549),
@@ -116,7 +116,7 @@ BOX = {
     "hub.weight_friction.level": (0.0, 0.48),
     "input.delay.time": (0.0, 0.05),
 }
-"""Where they are looked for: as far as those of M1 to M6."""
+"""Bounds of its parameters for CMA-ES, as wide as those of M1 to M6."""
 
 
 def servo(effects: tuple[fx.Effect, ...] = ()) -> rf.Mechanism:
@@ -137,15 +137,15 @@ def yielding() -> rf.Mechanism:
 
 
 def supply_resistance(servo: rf.Fit) -> list[float]:
-    """What the logged voltage of the supply says of its resistance: least squares over all logs [ohm].
+    """Resistance of the supply, estimated from its logged voltage by least squares over all logs [ohm].
 
-    The current before the bridge is the duty times that of the armature.
+    The current of the supply is the duty times the current of the armature.
 
     Args:
-        servo: The fit with the torque constant and the resistance of the armature.
+        servo: Fit with the torque constant and the resistance of the armature.
 
     Returns:
-        The resistance and its standard deviation, errors of the samples independent.
+        The resistance and its standard deviation, for independent errors of the samples.
     """
     constant, armature = (servo[f"hub.position_servo.{n}"].value for n in ("torque_constant", "resistance"))
     rows, volts = [], []
@@ -165,18 +165,18 @@ def supply_resistance(servo: rf.Fit) -> list[float]:
 
 
 def supply(split: Split) -> dict[str, list[float]]:
-    """Resistance of the supply by the motion, and by the voltage that was logged [ohm], with deviations."""
+    """Resistance of the supply from motion and from logged voltage, with standard deviations [ohm]."""
     fit, _ = fitted(yielding(), split)
     found = fit["hub.position_servo.source_resistance"]
     return {"motion": [found.value, found.std], "logged": supply_resistance(fit)}
 
 
 def released() -> dict[str, Any]:
-    """What the four runs say in which the torque is off: friction of the gear alone, and with the weight.
+    """Fits of three friction structures to the four runs in which the torque is off and the arm falls freely.
 
     Returns:
-        For each structure its free parameters with standard deviations, and the errors of free runs of 4 s
-        over the run of each gain [deg].
+        For each structure the free parameters with standard deviations, and the root mean square errors of
+        free runs of 4 s, one after each gain [deg].
     """
     runs = [r for r in map(rf.data.load_bam_xl330_released, rf.data.fetch("bam_xl330")) if r is not None]
     known = ("torque_constant", "resistance")
@@ -226,7 +226,7 @@ def fitted(
 
 
 def evolved_grey_box(split: Split, rollouts: int) -> dict[str, Any]:
-    """The numbers of one structure by CMA-ES, and its row of the results."""
+    """Row of the results for the structure `ALIKE`, fitted by CMA-ES."""
     model, row = evolved_alike(servo(FRICTION[ALIKE]), split.train, BOX, rollouts, seed=1)
     runs = lambda of: [model.simulate(r) for r in of]  # noqa: E731
     return row | {
@@ -236,15 +236,15 @@ def evolved_grey_box(split: Split, rollouts: int) -> dict[str, Any]:
 
 
 def of_the_package(mechanism: rf.Mechanism) -> list[tuple[type[fx.Effect], str]]:
-    """What a search tries by default, less effects of the benchmark's own, which are in the catalogue too."""
+    """Default candidates of a search, without the effects that this module adds to the catalogue."""
     return [p for p in search_places(mechanism) if p[0].__module__.startswith("rotflex_jax.")]
 
 
 def searched(split: Split, say: Callable[[str], None]) -> dict[str, Any]:
-    """The structure that a search of the training recordings finds, fitted by free runs to all of them.
+    """Row of the structure found by a search, fitted by free runs to all training recordings.
 
     Args:
-        split: What is learnt from.
+        split: Training and test recordings.
         say: Called with lines of progress.
     """
     base = servo()
@@ -271,10 +271,11 @@ def searched(split: Split, say: Callable[[str], None]) -> dict[str, Any]:
 
 
 def direction(split: Split, say: Callable[[str], None]) -> dict[str, Any]:
-    """Whether the recordings tell friction while lifting from friction while lowering, one mass as they are.
+    """Whether recordings with one mass distinguish friction while lifting from friction while lowering.
 
-    With both levels free, the torque constant, the resistance and the inertia can grow with their difference
-    as if the weight were another: the level of a fit has no bound in sight, and a search says so.
+    With both levels free, torque constant, resistance and inertia can grow together with the difference of
+    the levels, with nearly the same motion as a result. So a fit does not determine the level, and the
+    orthogonal fraction of the candidate in a search is small.
     """
     base = servo((WeightFriction("hub"),))
     both, row = fitted(base + LiftingFriction("hub"), split)

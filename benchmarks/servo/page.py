@@ -9,14 +9,14 @@ from rotflex_jax.parameters import HALF_WIDTH_95
 
 
 def mean(row: dict[str, Any], part: str, kind: str) -> float:
-    """Error of a part of the recordings, averaged over them [deg]."""
+    """Error averaged over the training or the test recordings [deg]."""
     return statistics.mean(e[kind] for e in row[part].values())
 
 
 def summary(splits: dict[str, Any]) -> dict[str, dict[str, float]]:
-    """What each model has over all that was left out: errors [deg], medians of free runs and times [s].
+    """Mean errors of each model on recordings that were left out [deg], median free runs and times [s].
 
-    A mean over motions, gains or all is there where nothing of it is missing.
+    A mean over all motions, all gains or both is given only if the model has results for each of them.
     """
     out: dict[str, dict[str, float]] = {}
     for name in dict.fromkeys(name for case in splits.values() for name in case):
@@ -36,7 +36,7 @@ def summary(splits: dict[str, Any]) -> dict[str, dict[str, float]]:
 
 
 def _label(name: str) -> str:
-    """A model as the page has it."""
+    """Name of a model on the page."""
     return "what the search finds" if name == "search" else name
 
 

@@ -1,4 +1,4 @@
-"""The recordings of the XL-330, what is left out of them in turn, and the error of a free run."""
+"""The recordings of the XL-330, their division into training and test data, and errors of free runs."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ def motion(recording: rf.Recording) -> str:
 
 @dataclasses.dataclass(frozen=True)
 class Split:
-    """What is learnt from and what is left out.
+    """Recordings for training and for the test.
 
     Attributes:
-        name: What is left out.
-        train: Learnt from.
-        test: Left out.
+        name: Motion or gain that is left out of the training.
+        train: Training recordings.
+        test: Test recordings: all with the motion or gain that is left out.
     """
 
     name: str
@@ -43,17 +43,17 @@ class Split:
 
     @property
     def search(self) -> tuple[rf.Recording, ...]:
-        """What a search fits: this share of every recording."""
+        """Training data of a search, the first 70 % of each training recording."""
         return tuple(r.split(SHARE)[0] for r in self.train)
 
     @property
     def validation(self) -> tuple[rf.Recording, ...]:
-        """What a search compares its models on: the rest of each."""
+        """Validation data of a search, the rest of each training recording."""
         return tuple(r.split(SHARE)[1] for r in self.train)
 
 
 def splits(recordings: Sequence[rf.Recording]) -> dict[str, Split]:
-    """Every motion and every gain left out once."""
+    """Splits by name, in each of which one motion or one gain is left out."""
 
     def one(name: str, of: Callable[[rf.Recording], object], left_out: object) -> Split:
         train = tuple(r for r in recordings if of(r) != left_out)
@@ -65,7 +65,7 @@ def splits(recordings: Sequence[rf.Recording]) -> dict[str, Split]:
 
 
 def logs(recordings: Sequence[rf.Recording]) -> Logs:
-    """The recordings as the extended friction models take them."""
+    """Recordings for the extended friction models."""
     N = max(r.N for r in recordings)
     pad = lambda x: np.pad(np.asarray(x, float), (0, N - len(x)))  # noqa: E731
     slopes = [np.polyfit(np.arange(r.n_init) * r.Ts, r.y[: r.n_init, 0], 1)[0] for r in recordings]

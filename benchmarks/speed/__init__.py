@@ -1,1 +1,1 @@
-"""How quick the toolkit is beside C, numba and the libraries that people use for the same work."""
+"""B7: computing times of the toolkit, compared with C, numba and other libraries for the same tasks."""

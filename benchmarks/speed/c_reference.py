@@ -1,4 +1,4 @@
-"""The C of `reference.c`, compiled when first asked for, as functions on arrays."""
+"""The functions of `reference.c` on arrays; the C code is compiled when it is first needed."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ _doubles = np.ctypeslib.ndpointer(np.float64, flags="C_CONTIGUOUS")
 
 
 def missing() -> str:
-    """Why there is no C, or nothing."""
+    """Reason why the C code cannot be compiled; empty if it can."""
     return "" if shutil.which("gcc") else "gcc is not installed"
 
 
 @functools.cache
 def library(memory: int = 5, options: tuple[str, ...] = PLAIN) -> ctypes.CDLL:
-    """The compiled functions for one memory."""
+    """The compiled functions for one number of delays."""
     out = Path(tempfile.mkdtemp(prefix="speed_c_")) / "reference.so"
     subprocess.run(
         ["gcc", *options, f"-DM={memory}", "-shared", "-fPIC", str(SOURCE), "-o", str(out), "-lm"], check=True
@@ -42,7 +42,7 @@ def library(memory: int = 5, options: tuple[str, ...] = PLAIN) -> ctypes.CDLL:
 
 
 def regressors(memory: int) -> int:
-    """Of the constant, the delays and their products."""
+    """Number of regressors: the constant, the delays and their products."""
     return 1 + memory + memory * (memory + 1) // 2
 
 
@@ -60,7 +60,7 @@ def lms(
 
 
 def lms_lanes(u: np.ndarray, y: np.ndarray, mu: np.ndarray, memory: int) -> np.ndarray:
-    """Sums of squared errors (LANES,) for step sizes (3, LANES)."""
+    """Sums of squared errors (LANES,) of LMS for step sizes (3, LANES)."""
     sse, w = np.zeros(LANES), np.zeros((regressors(memory), LANES))
     library(memory).lms_lanes(u, y, np.ascontiguousarray(mu), sse, w, len(u))
     return sse
@@ -77,14 +77,14 @@ def rls(u: np.ndarray, y: np.ndarray, lam: float, delta: float, memory: int) -> 
 def joint(
     u: np.ndarray, p: np.ndarray, Ts: float, substeps: int = 1, options: tuple[str, ...] = PLAIN
 ) -> np.ndarray:
-    """Angles (N, 2) of the flexible joint without current, by classical Runge-Kutta."""
+    """Angles (N, 2) of the flexible joint without motor current, by classical Runge-Kutta."""
     out = np.empty((len(u), 2))
     library(5, options).joint(u, p, Ts, substeps, out, len(u))
     return out
 
 
 def joint_current(u: np.ndarray, p: np.ndarray, motor: np.ndarray, Ts: float, substeps: int) -> np.ndarray:
-    """Angles (N, 2) of the flexible joint with its motor's current."""
+    """Angles (N, 2) of the flexible joint with motor current."""
     out = np.empty((len(u), 2))
     library().joint_current(u, p, motor, Ts, substeps, out, len(u))
     return out

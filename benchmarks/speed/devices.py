@@ -1,4 +1,4 @@
-"""The same work on one device of the processor and on two: a new process for either, in turn."""
+"""Times of the same work on one and on two JAX devices of the processor, each in new processes, in turn."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ WORK = "from speed.devices import work; work({count}, {seconds}, {starts}, {reco
 
 
 def devices(seconds: float, starts: int, recordings: int) -> dict[str, float]:
-    """Seconds on one and on two devices, least of several, and their ratios."""
+    """Seconds on one and on two devices, the least of three processes each, and their ratios."""
     facts: dict[str, float] = {}
     with tempfile.TemporaryDirectory() as cache:
         for _ in range(3):
@@ -29,7 +29,7 @@ def devices(seconds: float, starts: int, recordings: int) -> dict[str, float]:
 
 
 def work(count: int, seconds: float, starts: int, recordings: int) -> None:
-    """In the new process: does it all, and prints the least seconds of each."""
+    """Work of the new process: runs each task on `count` devices and prints its least time as JSON."""
     import rotflex_jax as rf
 
     rf.enable_fast_loops()

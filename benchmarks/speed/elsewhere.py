@@ -1,7 +1,8 @@
-"""Runs in an environment of its own, without this project: `python elsewhere.py RECORDING.npz`, prints JSON.
+"""Times of jax-sysid and sysidentpy: `python elsewhere.py RECORDING.npz` prints them as JSON.
 
-jax-sysid wants an older JAX. It fits the joint with the motor's current left out, one Runge-Kutta step per
-sample, in logarithms; sysidentpy chooses regressors of a Volterra series.
+Runs in a separate environment without this project, since jax-sysid needs an older JAX. jax-sysid fits the
+logarithms of the parameters of the joint without motor current, with one Runge-Kutta step per sample.
+sysidentpy selects regressors of a Volterra series.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import numpy as np
 
 
 def jax_sysid(kept: Any) -> dict[str, float]:
-    """Half the squared error in units of the noise, and seconds of a fit from the given start."""
+    """Seconds of a fit from the given start, and half the sum of squared errors in units of the noise."""
     import jax
     import jax.numpy as jnp
     from jax_sysid.models import Model
@@ -37,7 +38,7 @@ def jax_sysid(kept: Any) -> dict[str, float]:
         b = flow(x + Ts / 2 * a, u[0], p)
         return x + Ts / 6 * (k + 2 * a + 2 * b + flow(x + Ts * b, u[0], p))
 
-    # Scaled outputs, so that both channels count as in the other fits.
+    # Outputs are scaled so that both channels have the same weight as in the other fits.
     model = Model(4, 2, 1, state_fcn=step, output_fcn=lambda x, u, params: x[:2] / scale)
     model.loss(
         rho_x0=0.0,
@@ -58,7 +59,7 @@ def jax_sysid(kept: Any) -> dict[str, float]:
 
 
 def sysidentpy(kept: Any) -> dict[str, float]:
-    """Seconds to choose ten regressors, and the root mean square of what they leave [rad]."""
+    """Seconds to select ten regressors, and the root mean square error that remains [rad]."""
     from sysidentpy.basis_function import Polynomial
     from sysidentpy.model_structure_selection import FROLS
     from sysidentpy.parameter_estimation import LeastSquares
@@ -66,7 +67,7 @@ def sysidentpy(kept: Any) -> dict[str, float]:
     u, y = kept["u"].reshape(-1, 1), kept["y"][:, 1].reshape(-1, 1)
 
     def choose() -> Any:
-        # The recordings' lag 0 is their lag 1: the package has no direct path.
+        # The input is shifted by a sample, since the package starts at lag 1 and rotflex_jax here at lag 0.
         late = np.vstack([u[1:], u[-1:]])
         model = FROLS(
             order_selection=False,
@@ -89,7 +90,7 @@ def sysidentpy(kept: Any) -> dict[str, float]:
 
 
 def _timed(run: Callable[[], Any]) -> tuple[float, Any]:
-    """Least seconds of three by the clock, and the result."""
+    """Least wall-clock time of three runs [s], and the result."""
     times, found = [], None
     for _ in range(3):
         began = time.perf_counter()

@@ -1,4 +1,4 @@
-"""Adaptive filters over a second-order Volterra series, beside C, numba and padasip."""
+"""Times of adaptive filters over a second-order Volterra series, compared with C, numba and padasip."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from speed.rounds import Case
 
 NANO = 1e-9
 PYTHON_LOOP = 7000
-"""Samples for libraries that loop in Python."""
+"""Number of samples for libraries that loop in Python."""
 
 
 def record(N: int) -> tuple[np.ndarray, np.ndarray]:
-    """A coloured input and a noisy quadratic output."""
+    """A coloured input, and an output of a quadratic system with noise."""
     rng = np.random.default_rng(3)
     z = rng.standard_normal(N + 1)
     u = 0.8 * z[1:] + 0.6 * z[:-1]
@@ -34,12 +34,12 @@ def record(N: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def step_sizes(memory: int) -> tuple[float, float, float]:
-    """Well inside what is stable, one per degree."""
+    """Step sizes for the degrees 0, 1 and 2, far below the limit of stability."""
     return 2e-3, 5e-3 / memory, 5e-3 / memory**2
 
 
 def lms_cases(memory: int, N: int) -> list[Case]:
-    """One LMS run, of N samples."""
+    """Cases with one run of LMS over N samples."""
     u, y = record(N)
     sizes, basis = step_sizes(memory), Volterra(Delays(memory))
     filter = LMS(basis.step_sizes(dict(enumerate(sizes))))
@@ -74,7 +74,7 @@ def lms_cases(memory: int, N: int) -> list[Case]:
 
 
 def rls_cases(memory: int, N: int) -> list[Case]:
-    """One RLS run, of N samples."""
+    """Cases with one run of RLS over N samples."""
     u, y = record(N)
     basis, filter = Volterra(Delays(memory)), RLS(0.9999, 100.0)
     name = f"RLS {basis.size} weights"
@@ -104,7 +104,7 @@ def _build(memory: int) -> Any:
 
 
 def pairs_cases(N: int) -> list[Case]:
-    """A grid of 100 pairs of step sizes, and the gradient by both."""
+    """Cases with a grid of 100 pairs of step sizes, and with value and gradient for one pair."""
     u, y = record(N)
     recording = Recording(u=u, y=y, Ts=0.001, channels="alpha")
     basis = Volterra(Delays(5))
@@ -147,7 +147,7 @@ def pairs_cases(N: int) -> list[Case]:
 
 
 def sweep(N: int) -> Callable[[], None]:
-    """2000 pairs of step sizes, spread over all devices of the process."""
+    """Function that runs LMS for 2000 pairs of step sizes, divided among all devices of the process."""
     u, y = record(N)
     basis = Volterra(Delays(5))
     axes = np.geomspace(1e-4, 3e-3, 40), np.geomspace(1e-5, 5e-4, 50)

@@ -1,4 +1,7 @@
-"""Fits of eight parameters beside scipy, numba and optimistix: one start, many starts, several recordings."""
+"""Times of fits of eight parameters, compared with scipy, numba and optimistix.
+
+Measured are fits from one start, from many starts, and of several recordings together.
+"""
 
 from __future__ import annotations
 
@@ -14,14 +17,14 @@ from speed.machine import MOVED, TRUE, Ts, smooth, voltage
 from speed.rounds import Case
 
 BRIEF, SHOTS = 0.1, 3
-"""Of the fit with solve_ivp: seconds of the recording, and most steps."""
+"""Length of the recording for the fit with solve_ivp [s], and its largest number of steps."""
 SHORT, KEPT = 1.5, 8
-"""Of a staged search: seconds that all starts are fitted to, and how many go on."""
+"""Staged fit: length of the part to which all starts are fitted [s], and number of starts that are kept."""
 
 
 @functools.cache
 def recording(seconds: float, seed: int = 0) -> Recording:
-    """By the C, in eight steps per sample, with one per cent of noise."""
+    """Recording simulated by the C code with eight steps per sample, and with 1 % of noise."""
     u = voltage(round(seconds / Ts), seed)
     y = c_reference.joint(u, TRUE, Ts, substeps=8)
     y = y + 0.01 * np.std(y, axis=0) * np.random.default_rng(seed).standard_normal(y.shape)
@@ -29,7 +32,7 @@ def recording(seconds: float, seed: int = 0) -> Recording:
 
 
 def start(spread: float, seed: int) -> np.ndarray:
-    """Numbers of the machine, the moved ones off by up to `spread`."""
+    """Parameters of the machine, with the fitted ones changed at random by up to the share `spread`."""
     p = TRUE.copy()
     p[list(MOVED)] *= 1 + np.random.default_rng(seed).uniform(-spread, spread, len(MOVED))
     return p
@@ -66,7 +69,7 @@ def _numba_joint() -> Any:
 
 
 def scipy_fit(recordings: list[Recording], p0: np.ndarray) -> Any:
-    """scipy's Levenberg-Marquardt (MINPACK) in logarithms, slopes by differences, runs by numba from rest."""
+    """Fit of logarithms by scipy's Levenberg-Marquardt (MINPACK): finite differences, runs by numba."""
     scale = [0.01 * np.std(r.y, axis=0) for r in recordings]
     run = _numba_joint()
 
@@ -81,7 +84,7 @@ def scipy_fit(recordings: list[Recording], p0: np.ndarray) -> Any:
 
 
 def solve_ivp_fit(r: Recording, p0: np.ndarray) -> Any:
-    """The usual recipe: scipy's least squares, each run by solve_ivp, with steps no longer than a sample."""
+    """Fit by scipy's least squares, with each run by solve_ivp and steps no longer than a sample."""
     from speed.motion import solve_ivp_run
 
     scale = 0.01 * np.std(r.y, axis=0)
@@ -95,7 +98,7 @@ def solve_ivp_fit(r: Recording, p0: np.ndarray) -> Any:
 
 
 def scipy_staged(r: Recording, starts: int, spread: float) -> np.ndarray:
-    """Costs of the best, after all starts on the beginning; the same plan as `many_starts`."""
+    """Costs of the kept starts: all starts are fitted to the first part, as `many_starts` does it."""
     short = r.slice(0, round(SHORT / Ts))
     firsts = [scipy_fit([short], start(spread, k)) for k in range(starts)]
     best = sorted(firsts, key=lambda f: f.cost)[:KEPT]
@@ -139,7 +142,7 @@ def _optimistix_step() -> Any:
 
 
 def optimistix_fit(r: Recording, p0: np.ndarray) -> np.ndarray:
-    """optimistix's Levenberg-Marquardt as it comes, on textbook Runge-Kutta from rest."""
+    """Fit by optimistix's Levenberg-Marquardt, with classical Runge-Kutta from rest."""
     import jax
     import jax.numpy as jnp
 
@@ -153,7 +156,7 @@ def optimistix_fit(r: Recording, p0: np.ndarray) -> np.ndarray:
 
 
 def one_start(seconds: float) -> list[Case]:
-    """A fit from 30 % off."""
+    """Cases with one fit from start values up to 30 % wrong."""
     r, p0 = recording(seconds), start(0.3, 1)
     joint = smooth(p=p0)
     return [
@@ -177,7 +180,7 @@ def one_start(seconds: float) -> list[Case]:
 
 
 def joint_fit(count: int, seconds: float) -> list[Case]:
-    """Several recordings, common parameters."""
+    """Cases with a fit of common parameters to several recordings."""
     several = [recording(seconds, seed) for seed in range(count)]
     p0 = start(0.3, 1)
     joint = smooth(p=p0)
@@ -193,7 +196,10 @@ def joint_fit(count: int, seconds: float) -> list[Case]:
 
 
 def many(starts: int, seconds: float) -> tuple[list[Case], dict[str, Any]]:
-    """Staged searches from 70 % off; what they reached is written into the returned dictionary."""
+    """Cases with staged fits from starts up to 70 % wrong.
+
+    When the cases have run, the returned dictionary has the shares of kept starts that reach the least cost.
+    """
     r, reached = recording(seconds), {}
 
     def ours() -> None:
@@ -213,7 +219,7 @@ def many(starts: int, seconds: float) -> tuple[list[Case], dict[str, Any]]:
 
 
 def quality(seconds: float, starts: int = 8) -> dict[str, float]:
-    """How far costs from several starts lie above the least of them, and beside scipy's."""
+    """Largest excess of the cost over the least cost, for fits from several starts."""
     r = recording(seconds)
     costs = [
         many_starts(smooth(p=start(0.3, k)), r, starts=1, short_seconds=None).cost for k in range(starts)

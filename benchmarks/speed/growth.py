@@ -1,4 +1,4 @@
-"""Time and memory against the number of samples, each length in a process of its own."""
+"""Time and memory by number of samples, each measured in a separate process."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ WORK = {"LMS M=5": _lms, "simulate": _motion, "two runs of a fit": _sums}
 
 
 def grown(work: str, N: int) -> dict[str, float]:
-    """Seconds (least of three) and memory on top of the inputs [MB] for N samples."""
+    """Least time of three runs [s] over N samples, and their memory in addition to the inputs [MB]."""
     code = MEASURE.format(N=N, work=work)
     done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
     return json.loads(done.stdout.splitlines()[-1])

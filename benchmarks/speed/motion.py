@@ -1,4 +1,4 @@
-"""Simulation of the flexible joint beside C and scipy: time, slopes, and error."""
+"""Simulation of the flexible joint, compared with C and other libraries: times, derivatives and errors."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from speed.rounds import Case
 
 NANO = 1e-9
 FEW = 200
-"""Samples for solve_ivp."""
+"""Number of samples for solve_ivp."""
 PYTHON_LOOP = 2000
-"""Samples for what works expression by expression."""
+"""Number of samples for CasADi, which evaluates expression by expression."""
 
 
 def cases(N: int) -> list[Case]:
-    """Values and slopes over N samples."""
+    """Cases with simulations and derivatives over N samples."""
     u = voltage(N)
     one = N * NANO
     models = {
@@ -90,7 +90,11 @@ def _control(u: np.ndarray) -> list[Case]:
 
 
 def _slopes(joint: Any, solver: Any, u: np.ndarray) -> tuple[Any, Any, Any, Any]:
-    """The run, with its Jacobian carried and stored, and its normal equations, each compiled."""
+    """Functions, each compiled, for a run and its derivatives.
+
+    In order: the run; its Jacobian by sensitivities that are carried along; its Jacobian by forward-mode
+    differentiation; its normal equations.
+    """
     names = joint.parameter_names
     eight = np.array([names.index(n) for n in names if n in joint.free_names][-8:])
     structure = joint.structure
@@ -133,7 +137,7 @@ def _slopes(joint: Any, solver: Any, u: np.ndarray) -> tuple[Any, Any, Any, Any]
 
 
 def solve_ivp_run(u: np.ndarray, p: np.ndarray, **options: Any) -> np.ndarray:
-    """Angles (N, 2) by scipy's solver, started again at every step of the voltage."""
+    """Angles (N, 2) by scipy's solve_ivp, which is restarted at every step of the voltage."""
 
     def flow(_: float, x: np.ndarray, v: float) -> list[float]:
         spring = p[2] * x[1] + p[7] * x[1] ** 3 + p[6] * x[3]
@@ -153,7 +157,10 @@ def solve_ivp_run(u: np.ndarray, p: np.ndarray, **options: Any) -> np.ndarray:
 
 
 def errors() -> dict[str, float]:
-    """Relative error of the deflection against many small steps, each with its own physics."""
+    """Relative errors of the deflection against simulations with many small steps.
+
+    The references have the same physics, except that "leaving the current out" compares two models.
+    """
     found: dict[str, float] = {}
     for name, u in {"steps of 6 V": voltage(4000), "multisine of 3 V": multisine(4000)}.items():
         found |= {f"{name}: {what}": error for what, error in _errors(u).items()}

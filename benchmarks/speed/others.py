@@ -1,4 +1,4 @@
-"""Beside packages that do a like job in another way, or want an environment of their own."""
+"""Comparison with packages that use other methods for similar tasks, or need a separate environment."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ PEERS = ("jax-sysid==1.1.0", "sysidentpy==0.9.0")
 
 
 def others(seconds: float) -> dict[str, float]:
-    """Seconds by the clock, least of several, one after the other; errors reached beside them."""
+    """Wall-clock times, the least of several runs, and the errors that were reached."""
     r, p0 = recording(seconds), start(0.3, 1)
     with tempfile.TemporaryDirectory() as folder:
         file = f"{folder}/recording.npz"
@@ -65,7 +65,7 @@ def _sindy(r: Any, degree: int) -> float:
 
 
 def _environment() -> str:
-    """Python of an environment with the peers; made once, which takes minutes."""
+    """Python of an environment with the other packages; it is created once, which takes minutes."""
     folder = Path(tempfile.gettempdir()) / "_".join(["rotflex_jax", *PEERS])
     python = folder / "bin" / "python"
     if not (folder / "complete").exists():

@@ -1,4 +1,4 @@
-"""The same work by libraries that people use for it, each in the quickest way it offers."""
+"""The same tasks by other libraries, each by the fastest way that it offers."""
 
 from __future__ import annotations
 
@@ -42,27 +42,27 @@ def _numba_lms(memory: int) -> Any:
 
 
 def numba_lms(u: np.ndarray, y: np.ndarray, mu: tuple[float, float, float], memory: int) -> np.ndarray:
-    """A-priori errors of second-order Volterra LMS, with fast arithmetic."""
+    """A-priori errors of second-order Volterra LMS by numba, with `fastmath`."""
     step = np.concatenate([[mu[0]], np.full(memory, mu[1]), np.full(memory * (memory + 1) // 2, mu[2])])
     return _numba_lms(memory)(u, y, step)
 
 
 def padasip_lms(phi: np.ndarray, y: np.ndarray, mu: float) -> np.ndarray:
-    """Errors of padasip's LMS on given regressors."""
+    """A-priori errors of padasip's LMS on given regressors."""
     import padasip
 
     return padasip.filters.FilterLMS(n=phi.shape[1], mu=mu, w="zeros").run(y, phi)[1]
 
 
 def padasip_rls(phi: np.ndarray, y: np.ndarray, lam: float) -> np.ndarray:
-    """Errors of padasip's RLS on given regressors."""
+    """A-priori errors of padasip's RLS on given regressors."""
     import padasip
 
     return padasip.filters.FilterRLS(n=phi.shape[1], mu=lam, eps=0.01, w="zeros").run(y, phi)[1]
 
 
 def diffrax_joint(u: np.ndarray, p: np.ndarray, Ts: float) -> Callable[[], np.ndarray]:
-    """The joint without current by diffrax, one step of Tsit5 per sample, compiled."""
+    """Function that simulates the joint without current by diffrax, with one step of Tsit5 per sample."""
     import diffrax
     import jax
     import jax.numpy as jnp
@@ -101,7 +101,7 @@ def diffrax_joint(u: np.ndarray, p: np.ndarray, Ts: float) -> Callable[[], np.nd
 
 
 def casadi_joint(u: np.ndarray, p: np.ndarray, Ts: float) -> Callable[[], np.ndarray]:
-    """The joint without current by CasADi: classical Runge-Kutta, the samples by `mapaccum`."""
+    """Function that simulates the joint without current by CasADi: classical Runge-Kutta in `mapaccum`."""
     import casadi as ca
 
     x, v = ca.SX.sym("x", 4), ca.SX.sym("v")  # pyright: ignore[reportArgumentType]
@@ -117,5 +117,5 @@ def casadi_joint(u: np.ndarray, p: np.ndarray, Ts: float) -> Callable[[], np.nda
     d = flow(x + Ts * c)
     step = ca.Function("step", [x, v], [x + Ts / 6 * (a + 2 * b + 2 * c + d)])
     run = step.mapaccum(len(u))
-    # It gives the state after each sample; the one at it comes a sample earlier.
+    # `mapaccum` returns the state after each sample, so the outputs are shifted by one.
     return lambda: np.vstack([np.zeros(2), np.array(run(np.zeros(4), u[None])).T[:-1, :2]])

@@ -1,4 +1,4 @@
-"""New processes, timed whole: what a command waits for beside its work."""
+"""Times of whole new processes, including start-up, imports and compilation."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from typing import Any
 
 BEGIN = "import rotflex_jax as rf; rf.enable_fast_loops(); rf.enable_compilation_cache(); "
 IMPORTS = BEGIN + "rf.fit, rf.Recording, rf.joints, rf.effects"
-# Start values a fifth to a half off, of the joint that the measurements are made on.
+# Start values 20 to 40 % away from those of the joint that makes the recording.
 FIT = (
     BEGIN
     + """
@@ -31,10 +31,10 @@ END = "\nrf.fit(joint, rf.Recording(u=kept['u'], y=kept['y'], Ts=float(kept['Ts'
 
 
 def process(code: str, *arguments: str, cache: str, show: bool = False) -> dict[str, Any]:
-    """A new Python: its seconds by the clock and of the processor, and the JSON of its last line, if any.
+    """Runs a new Python process: its wall-clock and processor seconds, and the JSON of its last line.
 
-    It may keep the byte code of what it imports, as an installed package does. With `show` its errors and
-    progress go where those of this process go.
+    The process may store the byte code of imports, as it does for an installed package. With `show`, its
+    error stream is that of this process.
     """
     known = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
     known["PYTHONPATH"] = os.pathsep.join([str(Path(__file__).parents[1]), *sys.path])
@@ -55,7 +55,10 @@ def process(code: str, *arguments: str, cache: str, show: bool = False) -> dict[
 
 
 def cold(seconds: float) -> dict[str, float]:
-    """From the start of a process to a fit, with nothing compiled and with a warm cache; least of several."""
+    """Times of new processes that fit a recording or only import, the least of several.
+
+    The first process of the fit has nothing compiled, and its time is also given separately.
+    """
     import numpy as np
 
     from speed.fits import recording

@@ -1,4 +1,4 @@
-"""Timing on a machine that others use too: every case in turn, in a new random order each round."""
+"""Timing on a machine with other load: all cases in turn, in a new random order in each round."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from rich.progress import Progress
 
 @dataclasses.dataclass(frozen=True)
 class Case:
-    """One thing to time.
+    """A function to time.
 
     Attributes:
-        name: Row of the table.
-        call: Does the work once.
-        per: What the time is divided by, such as samples; 1 leaves seconds.
-        once: Whether a single visit has to do, for what takes many seconds.
-        note: For the table.
+        name: Name of the row in the table.
+        call: Function that does the work once.
+        per: Number by which the time is divided, such as samples times a unit; 1 gives seconds.
+        once: Whether to time the first call only, for work of many seconds.
+        note: Note in the table.
     """
 
     name: str
@@ -34,18 +34,18 @@ class Case:
 
 @dataclasses.dataclass(frozen=True)
 class Timed:
-    """What a case took [s per unit of `Case.per`].
+    """Times of a case [s per unit of `Case.per`].
 
     Attributes:
-        name: Of the case.
-        cpu: Processor time of all threads, the mean of a visit and the least of these: what waits for a
-            processor that others use is not in it. The time of other threads comes in ticks of some
-            milliseconds, so the least of single calls would be too small.
-        least: Least time by the clock.
-        median: Over the rounds, by the clock.
-        visits: How many.
-        first: Of the very first call [s], by the clock; it compiles.
-        note: Of the case.
+        name: Name of the case.
+        cpu: Processor time of all threads: the mean over the calls of a visit, and the least of these means.
+            Waiting for a processor that others use is not included. The time of other threads is counted in
+            ticks of some milliseconds, so the least of single calls would be too small.
+        least: Least wall-clock time.
+        median: Median over the rounds of the wall-clock time.
+        visits: Number of visits.
+        first: Wall-clock time of the first call, with compilation [s].
+        note: Note of the case.
     """
 
     name: str
@@ -60,18 +60,18 @@ class Timed:
 def timed(
     cases: Sequence[Case], rounds: int, progress: Progress, title: str, *, visit: float = 0.15, seed: int = 0
 ) -> dict[str, Timed]:
-    """Visits every case once per round; a visit counts by its quickest repetition.
+    """Visits every case once per round; a visit repeats its function and takes the least wall-clock time.
 
-    The first call is apart, for it compiles. Cases are compared within one call of this function only:
-    what else the machine does then falls on all alike, and least so on the minimum of processor time.
+    The first call is timed separately, since it compiles. Compare only cases of one call of this function:
+    other load on the machine then affects all of them alike, and the least processor time hardly at all.
 
     Args:
-        cases: With different names.
-        rounds: Visits of each.
-        progress: Shows how far it is.
-        title: For the bar.
-        visit: Repeat within a visit until this long [s].
-        seed: Of the order.
+        cases: Cases with different names.
+        rounds: Number of visits of each case.
+        progress: Progress display.
+        title: Title of the progress bar.
+        visit: Time for the repetitions of a visit [s].
+        seed: Seed of the order.
     """
     first: dict[str, float] = {}
     found: dict[str, list[tuple[float, float]]] = {c.name: [] for c in cases}
@@ -108,14 +108,14 @@ def timed(
 
 
 def _once(case: Case) -> tuple[float, float]:
-    """Seconds by the clock, and of the processor."""
+    """Wall-clock and processor seconds of one call."""
     begin, worked = time.perf_counter(), time.process_time()
     case.call()
     return time.perf_counter() - begin, time.process_time() - worked
 
 
 def _visit(case: Case, length: float) -> tuple[float, float]:
-    """The least by the clock and the mean of the processor's time, of repetitions over a while."""
+    """Least wall-clock time and mean processor time of repeated calls over some time [s]."""
     worked = time.process_time()
     seen, end = [_once(case)], time.perf_counter() + length
     while len(seen) < 1000 and time.perf_counter() < end:
@@ -124,7 +124,7 @@ def _visit(case: Case, length: float) -> tuple[float, float]:
 
 
 def noise(results: dict[str, Timed]) -> dict[str, float]:
-    """How restless the machine was: by how much the median lies above the minimum, and the load."""
+    """Noise of the times: excess of the median over the least time, and the load of the machine."""
     spreads = [r.median / r.least - 1 for r in results.values() if r.visits > 1]
     return {
         "typical_spread": statistics.median(spreads) if spreads else 0.0,
@@ -134,7 +134,7 @@ def noise(results: dict[str, Timed]) -> dict[str, float]:
 
 
 def least(run: Callable[[], Any], visits: int) -> tuple[float, Any]:
-    """Seconds by the clock of the quickest of some runs, the first apart, for it compiles; and the result."""
+    """Least wall-clock time of some runs [s], without the first run, which compiles, and the result."""
     times, found = [], run()
     for _ in range(visits):
         began = time.perf_counter()

@@ -1,4 +1,4 @@
-"""A search over the whole catalogue: from nothing, from a new process, and with everything compiled."""
+"""Times of a search over the catalogue: nothing compiled, a new process with a cache, everything loaded."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 from speed.processes import process
 
-# What is hidden in the records, 20 s at 500 Hz each, tuning seeds.
+# Hidden effects of the recordings, which have seeds of the tuning set and are sampled at 500 Hz.
 HIDDEN = ((), (("cubic_spring", "joint"),), (("coulomb", "hub"),), (("lag", "input"),))
 PROCESS = """
 import json, resource, sys, time
@@ -27,7 +27,7 @@ for path in sys.argv[1:]:
 peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 print(json.dumps({"rounds": rounds, "peak": peak}))
 """
-# What is hidden in the records of a fleet, as many of each.
+# Hidden effects of the recordings of a fleet, equally many of each.
 KINDS = (
     (),
     (("coulomb", "hub"),),
@@ -44,7 +44,7 @@ COMMAND = "import sys; from rotflex_jax.cli import main; sys.argv[0] = 'rotflex'
 
 
 def fleet(seconds: float, each: int) -> dict[str, float]:
-    """`rotflex discover FILES --each`, in the processes of this machine: nothing compiled, then all [s]."""
+    """Times of `rotflex discover FILES --each`, with nothing compiled and with everything compiled [s]."""
     from rotflex_jax.arena.simulator.records import make_record
 
     with tempfile.TemporaryDirectory() as folder:
@@ -67,7 +67,7 @@ def fleet(seconds: float, each: int) -> dict[str, float]:
 
 
 def searches(seconds: float) -> dict[str, float]:
-    """Times by the clock and of the processor [s], and memory [MB]."""
+    """Wall-clock and processor times of searches [s], and memory [MB]."""
     from rotflex_jax.arena.simulator.records import make_record
 
     with tempfile.TemporaryDirectory() as folder:
@@ -78,7 +78,7 @@ def searches(seconds: float) -> dict[str, float]:
             np.savez(paths[-1], u=made["u"], y=made["y"], Ts=made["Ts"])
         one, cache = paths[1], f"{folder}/cache"
         first, again = process(PROCESS, one, cache=cache), process(PROCESS, one, cache=cache)
-        # All of them twice: the second time everything is compiled and loaded.
+        # All recordings twice in one process: the second time everything is compiled and loaded.
         every = process(PROCESS, *paths, *paths, cache=cache)
     warm = every["rounds"][len(paths) :]
     return {

@@ -1,4 +1,4 @@
-"""The measurements as a page."""
+"""Results of B7 as markdown."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ TITLES = {
 
 
 def page(results: dict[str, Any]) -> str:
-    """Everything that was measured."""
+    """The page with all results."""
     m = results["machine"]
     lines = [
         "# Speed",
@@ -83,7 +83,7 @@ def _growth(found: dict[str, Any]) -> list[str]:
 
 
 def waiting(rows: list[dict[str, Any]]) -> list[str]:
-    """Searches by name: what each has compiled and loaded, and what it took."""
+    """Table of searches: compiled and loaded programs, times and memory."""
     shown = {"compiled": ".0f", "loaded": ".0f", "compiling": ".1f", "seconds": ".1f"}
     shown |= {"processor": ".1f", "memory": ".0f"}
     lines = [

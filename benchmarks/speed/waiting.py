@@ -1,8 +1,8 @@
-"""How long a person waits for a search: nothing compiled, compiled before, another effect, another length.
+"""Waiting times of a user for a search: nothing compiled, compiled before, another effect, another length.
 
-Each row is a search in a process of this machine, with the number of programs that it compiled and loaded,
-the seconds that compiling took (by the clock, added over threads), the whole by the clock and of the
-processor, and the memory of the process after it.
+Each row is a search, with the number of programs that it compiled and loaded, the time of compilation (wall
+clock, summed over threads), the wall-clock and processor times of the search, and the memory of the process
+after it.
 """
 
 from __future__ import annotations
@@ -16,11 +16,12 @@ import numpy as np
 
 from speed.processes import process
 
-# Two effects are hidden, as in a first search of the README; then others, then a shorter recording.
+# Two hidden effects, as in the first search of the README; another one; length of the shorter recording as a
+# share.
 FIRST = (("coulomb", "hub"), ("cubic_spring", "joint"))
 OTHER = (("quadratic_drag", "arm"),)
 SHORTER = 0.6
-# New processes of each kind, of which the medians are reported.
+# Number of new processes of each kind; the medians are reported.
 TIMES = 3
 SEARCHES = """
 import json, resource, sys, time
@@ -50,7 +51,7 @@ for path in sys.argv[2:]:
     })
 print(json.dumps({"rows": rows}))
 """
-# The command, as a shell runs it, up to its report.
+# The command `rotflex demo`, as run by a shell, with its report.
 DEMO = """
 import os, sys
 programs, report = sys.argv[1:]
@@ -65,10 +66,10 @@ Row = dict[str, Any]
 
 
 def waiting(seconds: float) -> list[Row]:
-    """Each search by its name.
+    """One row per search.
 
     Args:
-        seconds: Length of the recordings [s]; below 20 s each is searched once, the measured joint left out.
+        seconds: Length of the recordings [s]. Below 20 s each search runs once, without the measured joint.
     """
     whole = seconds >= 20.0
     with tempfile.TemporaryDirectory() as folder:
