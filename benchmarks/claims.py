@@ -1040,17 +1040,24 @@ def certainty_cost() -> str:
 
 # -- the next experiment ------------------------------------------------------------------------------------
 
+# Longest experiment of B4_sequential [s].
+LONGEST_EXPERIMENT = 20.0
+
+
+def _decision_seconds(how: dict[str, Any], case: dict[str, Any]) -> float:
+    """Time after which an experiment names the true model of a case [s]; the longest time if it does not."""
+    decided = how.get("decided", case["verdict"] == "decided")  # a case is its own sequential experiment
+    return how["seconds"] if decided and how["best"] == case["truth"] else LONGEST_EXPERIMENT
+
 
 def _until_decided(kind: str) -> list[tuple[float, float]]:
     """Times to a decision with a kind of standard input and with the sequential experiment, by case [s].
 
     Hopeless cases are left out. Without a right decision, the longest time counts.
     """
-    found = results("B4_sequential.json")
-    rows, most = [r for r in found["rows"] if not r["hopeless"]], 20.0
-    right = lambda how, r: how["best"] == r["truth"] and how.get("decided", r["verdict"] == "decided")  # noqa: E731
-    pairs = [(r, next(s for s in r["standard"] if s["input"] == kind)) for r in rows]
-    return [tuple(how["seconds"] if right(how, r) else most for how in (s, r)) for r, s in pairs]
+    rows = [r for r in results("B4_sequential.json")["rows"] if not r["hopeless"]]
+    pairs = [(next(s for s in r["standard"] if s["input"] == kind), r) for r in rows]
+    return [(_decision_seconds(s, r), _decision_seconds(r, r)) for s, r in pairs]
 
 
 def _kind_seconds(kind: str) -> str:
@@ -1072,8 +1079,9 @@ def _best_kind() -> str:
 
 def _medians() -> str:
     """Median time of the best kind of standard input over the median time of the sequential experiment."""
-    summary = results("B4_sequential.json")["summary"]
-    return f"{summary['kind_seconds'] / summary['seconds']:.1f}"
+    pairs = _until_decided(results("B4_sequential.json")["summary"]["kind"])
+    standard, sequential = (statistics.median(seconds) for seconds in zip(*pairs, strict=True))
+    return f"{standard / sequential:.1f}"
 
 
 def _slow_ratio() -> str:
@@ -1085,10 +1093,9 @@ def _slow_ratio() -> str:
     ratios = []
     for row in results("B4_sequential.json")["rows"]:
         if not row["hopeless"]:
-            right = lambda how, r=row: how["best"] == r["truth"] and how.get("decided", True)  # noqa: E731
-            fastest = min((s["seconds"] for s in row["standard"] if right(s)), default=20.0)
+            fastest = min(_decision_seconds(s, row) for s in row["standard"])
             if fastest > 1:
-                ratios.append(fastest / (row["seconds"] if right(row) else 20.0))
+                ratios.append(fastest / _decision_seconds(row, row))
     return f"{statistics.median(ratios):.1f}"
 
 

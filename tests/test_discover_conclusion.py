@@ -412,7 +412,7 @@ def test_a_sensor_of_unknown_noise_leaves_the_verdict_open() -> None:
     worse = Assessment({}, {"theta": math.nan, "alpha": 7.0, "beta": 6.0}, 0.0)
     assert "the error of alpha in short runs is above 1.5" in worse.criterion
     assert Assessment({}, {"theta": math.nan}, 0.0).grade is None
-    assert "no likelier with a random torque" in Assessment({}, {"theta": 1.0}, 0.0).criterion
+    assert "hardly likelier with a random torque" in Assessment({}, {"theta": 1.0}, 0.0).criterion
 
 
 def test_shares_and_nats_of_nothing_are_no_numbers() -> None:

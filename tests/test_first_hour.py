@@ -433,6 +433,14 @@ def test_a_wrong_probe_is_told_in_a_sentence(probes, said, monkeypatch) -> None:
         build(rf.joints.paper(), [(Power, "joint")], scales)
 
 
+@pytest.mark.parametrize("declared", ["amplitudes", "vanishes_with"])
+def test_a_name_that_is_no_parameter_is_refused(declared, monkeypatch) -> None:
+    """A comma is easily forgotten in a tuple of one name, which then is a text of letters."""
+    monkeypatch.setattr(Power, declared, ("stifness"))
+    with pytest.raises(InputError, match=r"Power has 's', 't', .* parameters are stiffness, offset; .*,\)"):
+        Power.probe_values(SCALE)
+
+
 def test_a_right_probe_is_taken_and_whole_numbers_are_numbers() -> None:
     assert Power.probe_values(SCALE) == (((1.0, 0.0),),)
 

@@ -102,6 +102,8 @@ def _page(cls: type[Effect]) -> str:
     if cls.amplitudes:
         absent = " and ".join(f"``{name}``" for name in cls.amplitudes)
         lines.append(f":Absent where: {absent} {'are' if len(cls.amplitudes) > 1 else 'is'} zero")
+    if cls.vanishes_with:
+        lines.append(":Vanishes with: " + " and ".join(f"``{name}``" for name in cls.vanishes_with))
     if cls.contains:
         lines.append(":Contains: " + ", ".join(f":doc:`{name}`" for name in cls.contains))
     if cls is not LearnedTorque:

@@ -146,7 +146,7 @@ class _Candidate(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class _FinalFitBuilder:
-    """The final fit of one search.
+    """Makes the final fit of one search.
 
     Attributes:
         state: The search with what it has found.

@@ -235,7 +235,7 @@ def replacing(
     for k, i in enumerate(c.parameters):
         if name[i] in known:
             # Parameters of the simpler effect keep their size; only other parameters get the share.
-            own[k] = known[name[i]] / (share if c.shrinking[k] else 1.0)
+            own[k] = known[name[i]] / (share if c.scaled[k] else 1.0)
     return with_effect(s, h, dataclasses.replace(start, values=own), share)
 
 
@@ -244,7 +244,7 @@ def with_effect(s: SuperModel, h: Hypothesis, start: CandidateStart, share: floa
     c = s.candidates[start.location]
     specs = [s.mechanism.parameter_specifications[i] for i in c.parameters]
     size = np.abs(np.array(c.probes[0])).max(axis=0)
-    values = np.where(c.shrinking, share * start.values, start.values)
+    values = np.where(c.scaled, share * start.values, start.values)
     for k, spec in enumerate(specs):
         # A lower bound is at minus infinity of the unconstrained coordinate: the start is a little above it.
         if np.isfinite(spec.lower) and k != c.line:

@@ -37,7 +37,7 @@ from rotflex_jax.discover.selection import (
     shares_at_each,
     shares_of_gain,
 )
-from rotflex_jax.discover.stepwise import AMPLITUDE_SHARES, refit_near_predictions, refit_without
+from rotflex_jax.discover.stepwise import START_SHARES, refit_near_predictions, refit_without
 from rotflex_jax.discover.supermodel import EffectLocation, SuperModel
 from rotflex_jax.discover.validation import Horizons, ValidatedHypothesis, validate
 from rotflex_jax.discover.verdict import NEAR_FLOOR, TORQUE_NATS
@@ -168,9 +168,9 @@ def refit_pairs(
     s, starts = problem.supermodel, []
     for pair in pairs:
         a, b = pair.starts
-        grown = [with_candidate(s, with_candidate(s, current, a, x), b, x) for x in AMPLITUDE_SHARES]
+        grown = [with_candidate(s, with_candidate(s, current, a, x), b, x) for x in START_SHARES]
         for h, other in zip(pair.alone, (b, a), strict=False):
-            grown += [with_candidate(s, h, other, x) for x in AMPLITUDE_SHARES]
+            grown += [with_candidate(s, h, other, x) for x in START_SHARES]
         starts.append(grown[int(np.argmax(problem.log_likelihoods(grown)))])
     return refit(problem, starts)
 

@@ -5,13 +5,14 @@ deviations of their differences over half-second blocks, or errors of short free
 noise, candidates with nearly the same gain are reported together too. A richer effect must be better than the
 simpler effect that it contains in one of three ways:
 
-- Predictions of validation and of training data are better, by two standard deviations of all blocks, and
-  free runs are no worse.
+- Predictions of validation data are better by 10 nats, those of training data by 20 nats, and both together
+  by two standard deviations of their blocks; free runs are no worse.
 - Free runs over validation and over training data are better, each by 2.5 standard deviations, with errors
-  smaller by a tenth.
-- Predictions of training data are better after the penalty for the parameters, and free runs over validation
-  and over training data each by 1.5 standard deviations, with errors smaller by a tenth. Predictions of
-  validation data are not worse by 1.5 standard deviations.
+  over validation data smaller by a tenth.
+- The model is poor with the simpler effect. Predictions of training data are better after the penalty for the
+  parameters, and those of all data by two standard deviations; free runs over validation and over training
+  data are better, each by 1.5 standard deviations, with errors over validation data smaller by a tenth.
+  Predictions of validation data may then be worse, by less than 1.5 standard deviations.
 
 Every candidate is compared at two horizons, with parameters fitted at each: predictions and short free runs.
 Where another part of the model is wrong, the likeliest predictor follows the data within a few samples, and
@@ -49,6 +50,9 @@ GAIN_APART = 0.1
 # An effect that predictions do not prefer must be preferred by free runs: by this many standard deviations of
 # the block gains, on validation and on training data, and with errors smaller by this (mean log ratio).
 FREE_RUN_Z, FREE_RUN_BETTER = 2.5, 0.1
+# A richer effect that predictions of training data prefer needs less certainty of free runs. Predictions of
+# validation data refuse it if they prefer the simpler effect by the second number of standard deviations.
+SUPPORT_Z, OBJECTION_Z = 1.5, 1.5
 # An effect that predictions prefer by this many standard deviations, on validation and on training data, need
 # not improve free runs that are dominated by another error, if it does not make them worse.
 PREDICTION_Z = 3.5
@@ -168,7 +172,7 @@ def admissible(
     if enough and min(ratio, as_trained) < limit:
         beyond_doubt = min(z, train_z) > PREDICTION_Z
         return not far or certainty > HELD_OUT_Z or as_trained < -FREE_RUN_BETTER or beyond_doubt
-    return far and _free_runs_insist(candidate, current)
+    return far and _free_runs_prefer(candidate, current, FREE_RUN_Z)
 
 
 def is_poor(t: ValidatedHypothesis, noise: Float[np.ndarray, " C"]) -> bool:
@@ -238,12 +242,17 @@ def choose(
     shares = {t.location: share for t, share in zip(able, shares_of_gain(able, current), strict=True)}
     winner = max(able, key=lambda t: shares[t.location])
 
+    def clearly_better(rich: ValidatedHypothesis, simple: ValidatedHypothesis) -> bool:
+        return _clearly_better(rich, simple, current, measured, noise)
+
     def simplest(t: ValidatedHypothesis) -> ValidatedHypothesis:
         """The best effect that `t` contains and is not clearly better than; `t` itself if there is none."""
-        simpler = [x for x in able if _contained(x, t) and not _clearly_better(t, x, current, measured)]
+        simpler = [x for x in able if _contained(x, t) and not clearly_better(t, x)]
         return max(simpler, key=lambda x: shares[x.location], default=t)
 
-    winner = simplest(winner)
+    # An effect that is clearly better than the leading one, which it contains, need not lead itself.
+    richer = [t for t in able if _contained(winner, t) and clearly_better(t, winner)]
+    winner = simplest(max(richer, key=lambda t: shares[t.location], default=winner))
     # Chance decides which of two alike candidates leads. Every machine has dry friction, so dry friction
     # comes first, then the candidate with fewer parameters. A candidate whose free runs are worse with the
     # parameters of predictions is excepted: such an effect may imitate another one.
@@ -300,7 +309,7 @@ def better_in_place(rival: ValidatedHypothesis, found: ValidatedHypothesis, meas
         found: The model that was found; its `parameter_count` counts the parameters of the effect.
         measured: Number of measured values in the training recordings.
     """
-    if _free_runs_insist(rival, found) and not predictions_apart(found, rival):
+    if _free_runs_prefer(rival, found, FREE_RUN_Z) and not predictions_apart(found, rival):
         return True
     more = max(rival.parameter_count - found.parameter_count, 0)
     gains = paired_gain(rival.blocks, found.blocks)[0], _training_gain(rival, found)[0]
@@ -457,10 +466,16 @@ def _contained(small: ValidatedHypothesis, large: ValidatedHypothesis) -> bool:
 
 
 def _clearly_better(
-    rich: ValidatedHypothesis, simple: ValidatedHypothesis, current: ValidatedHypothesis, measured: float
+    rich: ValidatedHypothesis,
+    simple: ValidatedHypothesis,
+    current: ValidatedHypothesis,
+    measured: float,
+    noise: Float[np.ndarray, " C"],
 ) -> bool:
     """Whether a richer effect is clearly better than the simpler one, in one of the ways of this module."""
-    if _free_runs_insist(rich, simple) or _all_but_validation_predictions(rich, simple, measured):
+    if _free_runs_prefer(rich, simple, FREE_RUN_Z):
+        return True
+    if is_poor(simple, noise) and _preferred_but_for_validation_predictions(rich, simple, measured):
         return True
     nats = paired_gain(rich.blocks, simple.blocks)[0]
     train = rich.hypothesis.log_likelihood - simple.hypothesis.log_likelihood
@@ -470,29 +485,33 @@ def _clearly_better(
     return nats > 10 and train > 20 and share > 0.003 and runs_as_well and predictions_apart(rich, simple)
 
 
-def _all_but_validation_predictions(
+def _preferred_but_for_validation_predictions(
     rich: ValidatedHypothesis, simple: ValidatedHypothesis, measured: float
 ) -> bool:
-    """Whether only predictions of validation data do not prefer a richer effect, and do not object either.
+    """Whether a richer effect is preferred by all but predictions of validation data, which do not object.
 
-    Where a model is poor, these predictions differ little between two laws of friction, and even rounding
-    may decide their sign. They must not refuse a law that all else prefers.
+    Where a model is poor, predictions of short validation data differ little between two laws of friction,
+    and rounding may decide their sign. They must not refuse a law that all else prefers.
     """
-    if rich.free_run is None or simple.free_run is None or log_best_ratio(rich, simple) > -FREE_RUN_BETTER:
+    more = max(rich.parameter_count - simple.parameter_count, 0)
+    if _training_gain(rich, simple)[0] < needed_gain(more, measured) or not predictions_apart(rich, simple):
         return False
-    train, train_z = _training_gain(rich, simple)
-    needed = needed_gain(max(rich.parameter_count - simple.parameter_count, 0), measured)
-    no_objection = paired_gain(rich.blocks, simple.blocks)[1] > -HELD_OUT_Z
-    prefer = train > needed and train_z > TRAIN_Z and _free_run_certainty(rich, simple) > HELD_OUT_Z
-    return no_objection and prefer
+    objects = paired_gain(rich.blocks, simple.blocks)[1] < -OBJECTION_Z
+    return not objects and _free_runs_prefer(rich, simple, SUPPORT_Z)
 
 
-def _free_runs_insist(candidate: ValidatedHypothesis, current: ValidatedHypothesis) -> bool:
-    """Whether free runs alone clearly prefer a candidate: by errors, and by all half-second blocks."""
+def _free_runs_prefer(candidate: ValidatedHypothesis, current: ValidatedHypothesis, least: float) -> bool:
+    """Whether free runs prefer a candidate: by errors, and by blocks of training and of validation data.
+
+    Args:
+        candidate: The model that may be better.
+        current: The model with which it is compared.
+        least: Standard deviations that the blocks of either data must exceed.
+    """
     runs, before = candidate.free_run, current.free_run
     if runs is None or before is None or _log_error_ratio(runs, before) > -FREE_RUN_BETTER:
         return False
-    return _free_run_certainty(candidate, current) > FREE_RUN_Z
+    return _free_run_certainty(candidate, current) > least
 
 
 def _free_run_certainty(a: ValidatedHypothesis, b: ValidatedHypothesis) -> float:

@@ -16,6 +16,7 @@ from rotflex_jax.discover.hypothesis import (
     is_physical,
     parameter_count,
     replacing,
+    usual_start,
     with_candidate,
     with_effect,
     without,
@@ -127,13 +128,13 @@ def values_given(problem: LikelihoodProblem) -> Hypothesis:
 
 # Steps of the fit from each shape of a candidate before the best shape is chosen.
 SHAPE_CHOICE_STEPS = 6
-# A refit may start at these shares of the amplitude that the score test suggests.
-AMPLITUDE_SHARES = (1.0, 0.4, 0.1, 0.02)
+# A refit may start at these shares of the amplitude that the score test suggests, or of a listed delay.
+START_SHARES = (1.0, 0.4, 0.1, 0.02)
 # A refit that gains less than this share of the gain that the score test expects has missed the optimum.
 STUCK_SHARE = 0.5
-# A model with one more effect is no worse at its optimum. A refit of a candidate with a promising score that
-# ends worse starts again from this share of the amplitude, where the effect does nearly nothing.
-LEAST_SHARE = 1e-3
+# A model with one more effect is no worse at its optimum. If the score test expects a gain of a candidate but
+# its refit ends worse than the model without it, the refit starts again from this share.
+NEARLY_ABSENT = 1e-3
 
 
 def refit_candidates(
@@ -144,18 +145,18 @@ def refit_candidates(
     The amplitude that the score test suggests is too large where an effect is strongly nonlinear. So a refit
     starts at the likeliest of several shares of this amplitude, and at the shape with which a few steps gain
     most. If a refit gains far less than the score test expects, it starts again from a small amplitude of
-    every shape; if it is still worse than the current model, from a very small one. An effect with memory
-    replaces the simpler effect that it contains, since the two in parallel would be a third effect.
+    every shape. If it is still worse than the current model, it starts from a very small one. An effect with
+    memory replaces the simpler effect that it contains, since the two in parallel would be a third effect.
     """
     s = problem.supermodel
     for c in starts:
-        make_ahead(problem.slopes, [with_candidate(s, current, c, AMPLITUDE_SHARES[0])])
+        make_ahead(problem.slopes, [with_candidate(s, current, c, START_SHARES[0])])
     # Each candidate has one thread from start to end, so none waits for the slowest one after every stage.
     refitted = on_threads(lambda c: _refit_candidate(problem, current, c), starts)
     # At its optimum an effect is no worse than an effect that it contains. A refit that is worse starts again
     # from the fit with the contained effect.
     below = [
-        (i, replacing(s, refitted[j], [b.location], a, AMPLITUDE_SHARES[-1]))
+        (i, replacing(s, refitted[j], [b.location], a, START_SHARES[-1]))
         for i, a in enumerate(starts)
         for j, b in enumerate(starts)
         if a.location.contains(b.location) and refitted[i].log_likelihood < refitted[j].log_likelihood
@@ -167,7 +168,7 @@ def _refit_candidate(problem: LikelihoodProblem, current: Hypothesis, start: Can
     """The current model with one candidate, refitted as in `refit_candidates`, without other candidates."""
     shapes = [dataclasses.replace(start, values=x) for x in (start.values, *start.others)]
     grown = [
-        [with_candidate(problem.supermodel, current, shape, share) for share in AMPLITUDE_SHARES]
+        [with_candidate(problem.supermodel, current, shape, share) for share in START_SHARES]
         for shape in shapes
     ]
     likely = problem.log_likelihoods([h for row in grown for h in row]).reshape(len(grown), -1)
@@ -179,9 +180,10 @@ def _refit_candidate(problem: LikelihoodProblem, current: Hypothesis, start: Can
         return refitted
     again = refit(problem, [row[-1] for row in grown])
     refitted = max([refitted, *again], key=lambda h: h.log_likelihood)
-    if start.expected_gain <= 0 or refitted.log_likelihood > current.log_likelihood - MIN_DECREASE_NATS:
+    no_worse = refitted.log_likelihood > current.log_likelihood - MIN_DECREASE_NATS
+    if no_worse or start.expected_gain <= 0 or not any(problem.supermodel.candidates[start.location].scaled):
         return refitted
-    nearly = [with_candidate(problem.supermodel, current, shape, LEAST_SHARE) for shape in shapes]
+    nearly = [with_candidate(problem.supermodel, current, shape, NEARLY_ABSENT) for shape in shapes]
     return max([refitted, *refit(problem, nearly)], key=lambda h: h.log_likelihood)
 
 
@@ -362,8 +364,10 @@ def remaining_rivals(
         return RemainingRivals(remaining, [])
     swapped = []
     for p, r in pairs:
-        start = CandidateStart(r, np.array(s.candidates[r].probes[0]).max(axis=0))
-        swapped.append(with_effect(s, without(s, final.hypothesis, p), start, 0.4))
+        less, start = without(s, final.hypothesis, p), usual_start(s, r)
+        shapes = [dataclasses.replace(start, values=x) for x in (start.values, *start.others)]
+        grown = [with_effect(s, less, shape, share) for shape in shapes for share in START_SHARES]
+        swapped.append(grown[int(np.argmax(problem.log_likelihoods(grown)))])
     validated = on_threads(lambda h: validate(validation, h), refit(problem, swapped))
     alike = {pair for pair, t in zip(pairs, validated, strict=True) if not distinguished(final, t)}
     left = {p: [r for r in remaining[p] if (p, r) in alike or CATALOG[r.effect].line] for p in found}

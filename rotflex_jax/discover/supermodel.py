@@ -130,7 +130,8 @@ class Candidate:
         probes: Alternatives (shapes), each a list of parameter vectors that are tried together, one direction
             of the score test per vector.
         amplitudes: For each parameter, whether it is an amplitude.
-        shrinking: For each parameter, whether the effect vanishes with it; true for each amplitude.
+        scaled: For each parameter, whether it is reduced where a fit starts at a share of the usual size. It
+            is for amplitudes and for what the effect `vanishes_with`.
         one_sided: Whether negative amplitudes are not physical.
         threshold: Whether a small amplitude does nothing at all, so that only runs at full size show what the
             effect does.
@@ -145,7 +146,7 @@ class Candidate:
     parameters: tuple[int, ...]
     probes: tuple[tuple[tuple[float, ...], ...], ...]
     amplitudes: tuple[bool, ...]
-    shrinking: tuple[bool, ...]
+    scaled: tuple[bool, ...]
     one_sided: bool
     threshold: bool = False
     line: int | None = None

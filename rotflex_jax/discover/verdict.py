@@ -109,8 +109,8 @@ class Assessment:
                 f"({self.torque_nats:.2g} nat per measured value, at most {TORQUE_NATS:g})"
             )
         return (
-            f"short runs are within {NEAR_FLOOR:g} times the sensor noise, and predictions are no likelier "
-            "with a random torque"
+            f"short runs are within {NEAR_FLOOR:g} times the sensor noise, and predictions are hardly "
+            "likelier with a random torque"
         )
 
     @property

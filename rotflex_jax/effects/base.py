@@ -160,8 +160,8 @@ class Effect(abc.ABC):
     ports: ClassVar[tuple[str, ...]] = ("hub", "arm", "joint")
     # Parameters that are amplitudes: the effect is inactive if all of them are zero.
     amplitudes: ClassVar[tuple[str, ...]] = ()
-    # Further parameters with which the effect vanishes, although it has no derivative where they are zero,
-    # such as the time of a delay. Refits also start from small shares of them.
+    # Further parameters with which the effect vanishes, such as the time of a delay, which is scored at a few
+    # sizes and not by a derivative at zero. Fits of a search also start from small values of them.
     vanishes_with: ClassVar[tuple[str, ...]] = ()
     # Simpler effects that this one contains at special values of its parameters.
     contains: ClassVar[tuple[str, ...]] = ()
@@ -331,6 +331,12 @@ class Effect(abc.ABC):
                 finite number for exactly the declared parameters.
         """
         given, names = cls.probes(scale), tuple(cls.declared())
+        strange = [n for n in (*cls.amplitudes, *cls.vanishes_with) if n not in names]
+        if strange:
+            raise InputError(
+                f"{cls.__name__} has {', '.join(map(repr, strange))} in `amplitudes` or `vanishes_with`, but "
+                f'its parameters are {", ".join(names)}; write a tuple of names as ("{names[0]}",).'
+            )
         right = "[[{" + ", ".join(f"{n!r}: 0.1" for n in names) + "}]], a list of shapes, each a list of sets"
         if not isinstance(given, Sequence) or not all(isinstance(group, Sequence) for group in given):
             raise InputError(
