@@ -186,7 +186,7 @@ KNOWN = {
         "-3.16": "published [N]",
         **dict.fromkeys(["5.7", "9.2"], "supply of a measured servo [V], as its files have it"),
         **dict.fromkeys(["0.85", "0.80"], "errors of B9 before something that was tried"),
-        **dict.fromkeys(["0.94", "0.48", "0.15"], "errors of a search on another processor"),
+        **dict.fromkeys(["0.94", "0.48", "0.15", "0.84"], "errors of earlier searches on two processors"),
         **dict.fromkeys(
             [
                 "0.88",
