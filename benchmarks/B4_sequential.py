@@ -34,6 +34,7 @@ import numpy as np
 
 import B0_discovery as B0
 import rotflex_jax as rf
+from claims import LONGEST_EXPERIMENT as MOST, decision_seconds
 from origin import begin
 from rotflex_jax.arena.marking import renamed
 from rotflex_jax.arena.simulator.records import COUNT, JITTER, make_record
@@ -46,7 +47,7 @@ from rotflex_jax.experiment.sequential import SHAPES_AFTER, SequentialExperiment
 from rotflex_jax.experiment.standard_inputs import MULTISINE_CREST, NOISE_CREST
 from rotflex_jax.text.files import write_file
 
-TS, ORDINARY, MOST, SEGMENT, CHECK, ERROR = 0.002, 6.0, 20.0, 0.5, 0.1, 0.01
+TS, ORDINARY, SEGMENT, CHECK, ERROR = 0.002, 6.0, 0.5, 0.1, 0.01
 LIMITS = rf.Limits(voltage=6.0, travel=np.deg2rad(90), deflection=np.deg2rad(10))
 # Limits of hopeless cases: within them, nothing moves far beyond the noise.
 NARROW = rf.Limits(voltage=0.3, travel=np.deg2rad(5), deflection=np.deg2rad(0.3))
@@ -264,15 +265,9 @@ def fastest(row: dict) -> dict:
     return min(good, key=lambda s: s["seconds"]) if good else least
 
 
-def own_seconds(row: dict) -> float:
-    """Time to a right decision by the sequential experiment [s]; the longest time if there is none."""
-    good = row["verdict"] == "decided" and row["best"] == row["truth"]
-    return row["seconds"] if good else MOST
-
-
 def ratio(row: dict) -> float:
     """Time of the fastest standard input over the time of the sequential experiment."""
-    return fastest(row)["seconds"] / own_seconds(row)
+    return fastest(row)["seconds"] / decision_seconds(row, row)
 
 
 def of_kinds(rows: list[dict]) -> dict[str, dict[str, float]]:
@@ -283,8 +278,8 @@ def of_kinds(rows: list[dict]) -> dict[str, dict[str, float]]:
         if not played:
             continue
         right = [s["decided"] and s["best"] == r["truth"] for r, s in played]
-        seconds = [s["seconds"] if good else MOST for (_, s), good in zip(played, right, strict=True)]
-        ratios = [t / own_seconds(r) for (r, _), t in zip(played, seconds, strict=True)]
+        seconds = [decision_seconds(s, r) for r, s in played]
+        ratios = [t / decision_seconds(r, r) for (r, _), t in zip(played, seconds, strict=True)]
         found[kind] = {
             "seconds": float(np.median(seconds)),
             "ratio": float(np.median(ratios)),
@@ -315,7 +310,7 @@ def totals(rows: list[dict]) -> dict:
         "standard_decided": len(sure),
         "standard_wrong": sum(not right for right in sure),
         "ratio": median([ratio(r) for r in told]),
-        "seconds": median([r["seconds"] for r in told]),
+        "seconds": median([decision_seconds(r, r) for r in told]),
         "standard_seconds": median([fastest(r)["seconds"] for r in told]),
         "kinds": kinds,
         "kind": one_kind,

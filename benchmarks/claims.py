@@ -330,15 +330,13 @@ _OF_STAGES = {
     "feedback to lqr": "2011 to 2026",
     "lqr and half of feedback to the rest": "2026 and half of 2011 to the rest",
     "feedback and half of lqr to the rest": "2011 and half of 2026 to the rest",
+    "first 70 % of all to the rest": "first 70 % of both to the rest",
 }
 MEASURED_DIRECTIONS |= {
     f"two_dof_link_{stage}: {way}": f"two-link machine, stage {stage}, {runs}"
     for stage in (1, 2)
     for way, runs in _OF_STAGES.items()
 }
-MEASURED_DIRECTIONS["two_dof_link_2: first 70 % of all to the rest"] = (
-    "two-link machine, stage 2, first 70 % of both to the rest"
-)
 
 
 def _whole_and_windows(errors: dict[str, Any], name: str, channel: str) -> str:
@@ -1044,7 +1042,7 @@ def certainty_cost() -> str:
 LONGEST_EXPERIMENT = 20.0
 
 
-def _decision_seconds(how: dict[str, Any], case: dict[str, Any]) -> float:
+def decision_seconds(how: dict[str, Any], case: dict[str, Any]) -> float:
     """Time after which an experiment names the true model of a case [s]; the longest time if it does not."""
     decided = how.get("decided", case["verdict"] == "decided")  # a case is its own sequential experiment
     return how["seconds"] if decided and how["best"] == case["truth"] else LONGEST_EXPERIMENT
@@ -1057,7 +1055,7 @@ def _until_decided(kind: str) -> list[tuple[float, float]]:
     """
     rows = [r for r in results("B4_sequential.json")["rows"] if not r["hopeless"]]
     pairs = [(next(s for s in r["standard"] if s["input"] == kind), r) for r in rows]
-    return [(_decision_seconds(s, r), _decision_seconds(r, r)) for s, r in pairs]
+    return [(decision_seconds(s, r), decision_seconds(r, r)) for s, r in pairs]
 
 
 def _kind_seconds(kind: str) -> str:
@@ -1093,9 +1091,9 @@ def _slow_ratio() -> str:
     ratios = []
     for row in results("B4_sequential.json")["rows"]:
         if not row["hopeless"]:
-            fastest = min(_decision_seconds(s, row) for s in row["standard"])
+            fastest = min(decision_seconds(s, row) for s in row["standard"])
             if fastest > 1:
-                ratios.append(fastest / _decision_seconds(row, row))
+                ratios.append(fastest / decision_seconds(row, row))
     return f"{statistics.median(ratios):.1f}"
 
 

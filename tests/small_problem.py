@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -10,6 +11,7 @@ from rotflex_jax.arena.simulator.records import make_record
 from rotflex_jax.discover.hypothesis import Hypothesis, Whitener
 from rotflex_jax.discover.likelihood import LikelihoodProblem, levenberg_marquardt
 from rotflex_jax.discover.supermodel import EffectLocation, SuperModel, build, scales
+from rotflex_jax.effects.base import Effect
 from rotflex_jax.fit.dataset import Dataset, prepare
 from rotflex_jax.joints import paper
 from rotflex_jax.mechanism import Exponential, Mechanism
@@ -53,16 +55,20 @@ def baseline() -> Mechanism:
 @functools.cache
 def supermodel() -> SuperModel:
     """One super-model for all tests, so that it is compiled once."""
-    found = recordings(records())
-    return build(baseline(), WANTED, scales(Model(baseline()), found, dataset(found).torque_scale))
+    return supermodel_of(WANTED, recordings(records()))
+
+
+def supermodel_of(wanted: Sequence[tuple[type[Effect], str]], found: tuple[Recording, ...]) -> SuperModel:
+    """A super-model of other candidates, with the sizes of given recordings."""
+    return build(baseline(), wanted, scales(Model(baseline()), found, dataset(found).torque_scale))
 
 
 def dataset(found: tuple[Recording, ...]) -> Dataset:
     return dataclasses.replace(prepare(Model(baseline()), found), noise=NOISE)
 
 
-def problem(found: tuple[Recording, ...]) -> LikelihoodProblem:
-    return LikelihoodProblem.of(supermodel(), SOLVER, dataset(found), ("hub", "joint"))
+def problem(found: tuple[Recording, ...], s: SuperModel | None = None) -> LikelihoodProblem:
+    return LikelihoodProblem.of(s or supermodel(), SOLVER, dataset(found), ("hub", "joint"))
 
 
 def unfitted(s: SuperModel, count: int = 2) -> Hypothesis:

@@ -310,7 +310,7 @@ def test_a_pair_is_refitted_from_its_likeliest_start(s, monkeypatch: pytest.Monk
     pair = PairStart(ends, alone=(grown(s, h, SPRING, 2.0), moved))
     for wanted in (h, *pair.alone):
         near = SimpleNamespace(
-            supermodel=s, log_likelihoods=lambda hs, z=wanted.z: [-np.count_nonzero(x.z - z) for x in hs]
+            supermodel=s, likeliest=lambda hs, z=wanted.z: max(hs, key=lambda x: -np.count_nonzero(x.z - z))
         )
         (both,) = refit_pairs(near, h, [pair])
         assert {SPRING, DAHL} <= set(both.locations) and len(both.locations) == len(h.locations) + 2

@@ -10,10 +10,9 @@ import rotflex_jax.effects as fx
 from rotflex_jax.discover.hypothesis import CandidateStart, Hypothesis, usual_start, with_candidate
 from rotflex_jax.discover.likelihood import LikelihoodProblem, refit
 from rotflex_jax.discover.stepwise import fit_baseline, refit_candidates
-from rotflex_jax.discover.supermodel import EffectLocation, SuperModel, build, scales
+from rotflex_jax.discover.supermodel import EffectLocation, SuperModel
 from rotflex_jax.discover.validation import as_free_run
 from rotflex_jax.fit.dataset import Windows
-from rotflex_jax.models.model import Model
 
 WANTED = [(fx.Lag, "input"), (fx.Delay, "input"), (fx.Gravity, "hub"), (fx.ChannelDelay, "alpha")]
 LAG, DELAY, GRAVITY, LATE = (EffectLocation(cls.name, port) for cls, port in WANTED)
@@ -30,9 +29,8 @@ class Fitted(NamedTuple):
 @pytest.fixture(scope="module")
 def fitted() -> Fitted:
     found = sp.recordings(sp.records(0.0))
-    data = sp.dataset(found)
-    s = build(sp.baseline(), WANTED, scales(Model(sp.baseline()), found, data.torque_scale))
-    problem = LikelihoodProblem.of(s, sp.SOLVER, data, ("hub", "joint"))
+    s = sp.supermodel_of(WANTED, found)
+    problem = sp.problem(found, s)
     return Fitted(s, problem, fit_baseline(problem))
 
 

@@ -10,10 +10,9 @@ import small_problem as sp
 import rotflex_jax as rf
 import rotflex_jax.effects as fx
 from rotflex_jax.discover.evaluation import calibrate
-from rotflex_jax.discover.likelihood import LikelihoodProblem, refit
+from rotflex_jax.discover.likelihood import refit
 from rotflex_jax.discover.score_test import score_test
 from rotflex_jax.discover.stepwise import fit_baseline, refit_candidates
-from rotflex_jax.discover.supermodel import build, scales
 from rotflex_jax.discover.validation import Horizons, as_free_run, validate
 from rotflex_jax.errors import InputError
 from rotflex_jax.fit.coordinates import FitCoordinates
@@ -122,11 +121,10 @@ def test_sensors_with_states_of_their_own_start_again_too():
 
 def test_a_late_channel_is_seen_at_both_horizons():
     """The score test finds a delay of alpha by one sample, and a refit gains what the score predicts."""
-    made = [dataclasses.replace(r, y=late(r.y)) for r in sp.recordings(sp.records(0.0))]
-    data = sp.dataset(tuple(made))
+    made = tuple(dataclasses.replace(r, y=late(r.y)) for r in sp.recordings(sp.records(0.0)))
     wanted = [(fx.ChannelDelay, "alpha"), (fx.CrossTalk, "alpha"), *sp.WANTED]
-    s = build(sp.baseline(), wanted, scales(Model(sp.baseline()), made, data.torque_scale))
-    problem = LikelihoodProblem.of(s, sp.SOLVER, data, ("hub", "joint"))
+    s = sp.supermodel_of(wanted, made)
+    problem = sp.problem(made, s)
     both = Horizons.of(Model(sp.baseline()), problem, None, SECONDS)
     h = fit_baseline(both.prediction.problem)
     runs = refit(both.free_run.problem, [as_free_run(both.free_run.problem, h)])[0]

@@ -206,6 +206,11 @@ class CandidateStart:
     others: tuple[Float[np.ndarray, " K"], ...] = ()
     expected_gain: float = 0.0
 
+    @property
+    def shapes(self) -> list["CandidateStart"]:
+        """The start at each of its shapes, the best one first."""
+        return [dataclasses.replace(self, values=x) for x in (self.values, *self.others)]
+
 
 def usual_start(s: SuperModel, location: EffectLocation) -> CandidateStart:
     """A start of a candidate at its usual sizes, for each of its shapes."""

@@ -235,6 +235,10 @@ class LikelihoodProblem:
         each = self.predictor.of_innovations
         return np.array(each(lambda _, e: self.log_likelihood(e), parameter_sets, self.windows.index))
 
+    def likeliest(self, hypotheses: Sequence[Hypothesis]) -> Hypothesis:
+        """The likeliest of some hypotheses as they are, such as starts of one fit."""
+        return hypotheses[int(np.argmax(self.log_likelihoods(hypotheses)))]
+
     def with_likelihood(self, h: Hypothesis) -> Hypothesis:
         """The hypothesis, run once, with the whitener and the likelihood of its innovations."""
         return self.evaluated(h, self.innovations([h])[0])

@@ -171,7 +171,7 @@ def refit_pairs(
         grown = [with_candidate(s, with_candidate(s, current, a, x), b, x) for x in START_SHARES]
         for h, other in zip(pair.alone, (b, a), strict=False):
             grown += [with_candidate(s, h, other, x) for x in START_SHARES]
-        starts.append(grown[int(np.argmax(problem.log_likelihoods(grown)))])
+        starts.append(problem.likeliest(grown))
     return refit(problem, starts)
 
 

@@ -311,9 +311,8 @@ def better_in_place(rival: ValidatedHypothesis, found: ValidatedHypothesis, meas
     """
     if _free_runs_prefer(rival, found, FREE_RUN_Z) and not predictions_apart(found, rival):
         return True
-    more = max(rival.parameter_count - found.parameter_count, 0)
-    gains = paired_gain(rival.blocks, found.blocks)[0], _training_gain(rival, found)[0]
-    enough = gains[0] > HELD_OUT_NATS and gains[1] > needed_gain(more, measured)
+    gain = paired_gain(rival.blocks, found.blocks)[0]
+    enough = gain > HELD_OUT_NATS and _pays_in_training(rival, found, measured)
     return enough and predictions_apart(rival, found) and free_runs_apart(rival, found)
 
 
@@ -334,9 +333,13 @@ def _is_worth(rich: ValidatedHypothesis, simple: ValidatedHypothesis, measured: 
         simple: The model with the effect that it contains.
         measured: Number of measured values in the training recordings.
     """
-    more = rich.parameter_count - simple.parameter_count
-    gain = rich.log_likelihood - simple.log_likelihood
-    return gain > 0 and _training_gain(rich, simple)[0] > needed_gain(more, measured)
+    return rich.log_likelihood > simple.log_likelihood and _pays_in_training(rich, simple, measured)
+
+
+def _pays_in_training(a: ValidatedHypothesis, b: ValidatedHypothesis, measured: float) -> bool:
+    """Whether predictions of training data prefer `a` to `b` after the penalty for further parameters."""
+    more = max(a.parameter_count - b.parameter_count, 0)
+    return _training_gain(a, b)[0] > needed_gain(more, measured)
 
 
 def needed_gain(parameter_count: int, measured: float) -> float:
@@ -493,11 +496,10 @@ def _preferred_but_for_validation_predictions(
     Where a model is poor, predictions of short validation data differ little between two laws of friction,
     and rounding may decide their sign. They must not refuse a law that all else prefers.
     """
-    more = max(rich.parameter_count - simple.parameter_count, 0)
-    if _training_gain(rich, simple)[0] < needed_gain(more, measured) or not predictions_apart(rich, simple):
+    if paired_gain(rich.blocks, simple.blocks)[1] < -OBJECTION_Z:
         return False
-    objects = paired_gain(rich.blocks, simple.blocks)[1] < -OBJECTION_Z
-    return not objects and _free_runs_prefer(rich, simple, SUPPORT_Z)
+    preferred = _pays_in_training(rich, simple, measured) and predictions_apart(rich, simple)
+    return preferred and _free_runs_prefer(rich, simple, SUPPORT_Z)
 
 
 def _free_runs_prefer(candidate: ValidatedHypothesis, current: ValidatedHypothesis, least: float) -> bool:

@@ -166,13 +166,9 @@ def refit_candidates(
 
 def _refit_candidate(problem: LikelihoodProblem, current: Hypothesis, start: CandidateStart) -> Hypothesis:
     """The current model with one candidate, refitted as in `refit_candidates`, without other candidates."""
-    shapes = [dataclasses.replace(start, values=x) for x in (start.values, *start.others)]
-    grown = [
-        [with_candidate(problem.supermodel, current, shape, share) for share in START_SHARES]
-        for shape in shapes
-    ]
-    likely = problem.log_likelihoods([h for row in grown for h in row]).reshape(len(grown), -1)
-    likeliest = [row[int(np.argmax(ll))] for row, ll in zip(grown, likely, strict=True)]
+    s = problem.supermodel
+    grown = [[with_candidate(s, current, shape, x) for x in START_SHARES] for shape in start.shapes]
+    likeliest = [problem.likeliest(row) for row in grown]
     if len(likeliest) > 1:
         likeliest = levenberg_marquardt(problem, likeliest, max_steps=SHAPE_CHOICE_STEPS)
     (refitted,) = refit(problem, [max(likeliest, key=lambda h: h.log_likelihood)])
@@ -181,9 +177,9 @@ def _refit_candidate(problem: LikelihoodProblem, current: Hypothesis, start: Can
     again = refit(problem, [row[-1] for row in grown])
     refitted = max([refitted, *again], key=lambda h: h.log_likelihood)
     no_worse = refitted.log_likelihood > current.log_likelihood - MIN_DECREASE_NATS
-    if no_worse or start.expected_gain <= 0 or not any(problem.supermodel.candidates[start.location].scaled):
+    if no_worse or start.expected_gain <= 0 or not any(s.candidates[start.location].scaled):
         return refitted
-    nearly = [with_candidate(problem.supermodel, current, shape, NEARLY_ABSENT) for shape in shapes]
+    nearly = [with_candidate(s, current, shape, NEARLY_ABSENT) for shape in start.shapes]
     return max([refitted, *refit(problem, nearly)], key=lambda h: h.log_likelihood)
 
 
@@ -364,10 +360,8 @@ def remaining_rivals(
         return RemainingRivals(remaining, [])
     swapped = []
     for p, r in pairs:
-        less, start = without(s, final.hypothesis, p), usual_start(s, r)
-        shapes = [dataclasses.replace(start, values=x) for x in (start.values, *start.others)]
-        grown = [with_effect(s, less, shape, share) for shape in shapes for share in START_SHARES]
-        swapped.append(grown[int(np.argmax(problem.log_likelihoods(grown)))])
+        less, shapes = without(s, final.hypothesis, p), usual_start(s, r).shapes
+        swapped.append(problem.likeliest([with_effect(s, less, c, x) for c in shapes for x in START_SHARES]))
     validated = on_threads(lambda h: validate(validation, h), refit(problem, swapped))
     alike = {pair for pair, t in zip(pairs, validated, strict=True) if not distinguished(final, t)}
     left = {p: [r for r in remaining[p] if (p, r) in alike or CATALOG[r.effect].line] for p in found}
