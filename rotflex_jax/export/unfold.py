@@ -208,7 +208,7 @@ RULES: dict[str, Callable[[list[Any], Any], list[Any]]] = {
 }
 
 
-_SAME = {"copy_p", "stop_gradient", "optimization_barrier", "device_put", "reduce_precision"}
+_SAME = {"copy_p", "stop_gradient", "optimization_barrier", "device_put", "computed_once"}
 CALLS = {"jit", "pjit", "closed_call", "core_call", "custom_jvp_call", "custom_vjp_call", "remat"}
 _LONGEST_UNROLLED_LOOP = 256
 

@@ -14,15 +14,20 @@ import jax.numpy as jnp
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 from jaxtyping import Array
 
+from rotflex_jax.mechanism.small_matrices import computed_once
+
 # Elementwise operations: the result at an index depends on the operands at that index alone.
 # fmt: off
 _BY_PLACE = {
-    "abs", "add", "add_any", "and", "atan2", "clamp", "convert_element_type", "copy", "cos", "cosh",
-    "div", "eq", "exp", "exp2", "expm1", "floor", "ge", "gt", "integer_pow", "is_finite", "le", "log",
-    "log1p", "logistic", "lt", "max", "min", "mul", "ne", "neg", "not", "or", "pow", "reduce_precision",
-    "rsqrt", "select_n", "sign", "sin", "sinh", "sqrt", "square", "sub", "tan", "tanh", "xor",
+    "abs", "add", "add_any", "and", "atan2", "clamp", "computed_once", "convert_element_type", "copy",
+    "cos", "cosh", "div", "eq", "exp", "exp2", "expm1", "floor", "ge", "gt", "integer_pow", "is_finite",
+    "le", "log", "log1p", "logistic", "lt", "max", "min", "mul", "ne", "neg", "not", "or", "pow",
+    "reduce_precision", "rsqrt", "select_n", "sign", "sin", "sinh", "sqrt", "square", "sub", "tan",
+    "tanh", "xor",
 }
 # fmt: on
+# Operations that take long, but that the compiler would compute again for each direction.
+_THOUGHT_CHEAP = {"sin", "cos"}
 # Reductions that give the same result for one copy as for several.
 _SAME_OF_COPIES = {"reduce_and", "reduce_max", "reduce_min", "reduce_or"}
 
@@ -114,6 +119,8 @@ def _applied(equation: Any, operands: list[Any], length: int) -> list[Any]:
         result = primitive.bind(*functions, *(_whole(x, length) for x in operands), **bound)
         return list(result) if primitive.multiple_results else [result]
     once = primitive.bind(*(x.once if isinstance(x, _Once) else x for x in operands), **(params | changed))
+    if primitive.name in _THOUGHT_CHEAP:
+        once = computed_once(once)
     return [_Once(x) for x in (once if primitive.multiple_results else [once])]
 
 

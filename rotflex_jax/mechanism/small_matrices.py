@@ -7,12 +7,14 @@ units.
 
 import functools
 import operator
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, Shaped
 
 from rotflex_jax.effects.base import Effect
@@ -59,13 +61,30 @@ def with_rows(x: Shaped[Array, "n *S"], rows: Mapping[int, Shaped[Array, "*S"]])
 
 
 def computed_once(a: Shaped[Array, "*S"]) -> Shaped[Array, "*S"]:
-    """The same array, stored by the compiler, which would otherwise recompute a cheap array for each use.
+    """The same array, stored by the compiler, which would otherwise compute a cheap array again for each use.
 
-    A reduction to the precision that the array already has is an operation that the compiler neither removes
-    nor repeats.
+    A torque acts on every state, so that the torque and its tangents would be computed for each of them.
     """
-    kept = jnp.finfo(a.dtype)
-    return jax.lax.reduce_precision(a, kept.nexp, kept.nmant)
+    return _computed_once.bind(jnp.asarray(a))
+
+
+def _divided(a: Array) -> Array:
+    """`a` itself: the compiler does not repeat a division, and does not see that its denominator is one."""
+    return a / jnp.where(a == a, 1, a)  # only NaN differs from itself
+
+
+# A primitive, since a derivative of the division would be neither linear nor cheap.
+_computed_once = Primitive("computed_once")
+_computed_once.def_impl(_divided)
+_computed_once.def_abstract_eval(lambda a: a)
+mlir.register_lowering(_computed_once, mlir.lower_fun(_divided, multiple_results=False))
+ad.deflinear(_computed_once, lambda tangent: [computed_once(tangent)])
+batching.defvectorized(_computed_once)
+
+
+def rows_once(rows: Sequence[Shaped[Array, "*S"]]) -> Shaped[Array, "k *S"]:
+    """The rows as one array, each `computed_once`: stored as a whole they would be computed with branches."""
+    return jnp.stack([computed_once(row) for row in rows])
 
 
 def evaluate_effect(e: Effect, function: Callable[..., Any], *signals: Shaped[Array, "*S"]) -> Any:

@@ -37,6 +37,7 @@ from rotflex_jax.mechanism.small_matrices import (
     evaluate_effect,
     expand_axes,
     matvec,
+    rows_once,
     scaled_vector,
     sparse_matvec,
     with_rows,
@@ -372,7 +373,7 @@ def torques(
         k = layout.torque_ports.index(e.at)
         drive = drive_of(mechanism, e, x, z, voltage, gates)
         total[k] = total[k] + gate[i] * _force(e, memory[m], position[k], speed[k], drive)
-    return computed_once(jnp.stack(total))
+    return rows_once(total)
 
 
 def memory_rates(
@@ -415,6 +416,7 @@ def advance_memories(
         return z
     # The drive of each flow is held, and with it the states of other memories.
     after = exponential_euler(lambda s: memory_rates(mechanism, x, s, v, gates, z), z, h)
+    after = rows_once(jnp.unstack(after))
     limits = np.array([e.limits for _, e in effects_of(mechanism, Memory)])
     if not np.isfinite(limits).any():
         return after
@@ -556,7 +558,9 @@ def _advance_smooth(
     end = guess if brake is None else guess + matvec(c.hold, brake)
     z1 = advance_memories(mechanism, z, (x + end) / 2, voltage, c.gates, c.h)
     if solver.order == 2:
-        final = guess + matvec(c.ramp, torques(mechanism, end, z1, v, c.gates) - f0)
+        f1 = torques(mechanism, end, z1, v, c.gates)
+        change = jnp.stack([b - a for a, b in zip(jnp.unstack(f0), jnp.unstack(f1), strict=True)])
+        final = guess + matvec(c.ramp, change)
     else:
         own = end if extra is None else end - extra
         final = guess + _fourth_order(mechanism, x, z, z1, v, f0, brake, own, c)
@@ -608,7 +612,7 @@ def _friction_levels(
         for levels, direction in ((up, 1.0), (down, -1.0)):
             level = friction_level(e, position[k], speed[k], direction, None if load is None else load[k])
             levels[k] = levels[k] + gate[i] * level
-    return jnp.stack([computed_once(x) for x in up]), jnp.stack([computed_once(x) for x in down])
+    return rows_once(up), rows_once(down)
 
 
 def _predicted_friction(
@@ -647,6 +651,7 @@ def _with_dry_friction(
         if not steady:
             final = levels_after(coupled_contacts(v0, free, stop, *levels, passes=1).torque)
         found = coupled_contacts(v0, free, stop, *final, passes=passes)
+        found = found._replace(torque=rows_once(jnp.unstack(found.torque)))
         return _stopped(layout, c, end + matvec(c.hold[:, :k], found.torque), q0, v0, found, final)
 
     def sliding() -> tuple[Array, Callable[[], Array]]:
@@ -686,4 +691,4 @@ def _stopped(
         alone.append(jnp.where(found.crossed[i], shift[i] / own, 0.0))
     works = found.crossed & (levels[0] + levels[1] > 0)
     impulse = solve_masked(c.mobility[:k, :k], works, jnp.stack(shift), jnp.stack(alone))
-    return end + matvec(c.push[:, :k], impulse)
+    return end + matvec(c.push[:, :k], rows_once(jnp.unstack(impulse)))
