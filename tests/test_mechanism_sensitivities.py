@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import re
 from typing import Any
 
 import jax
@@ -273,3 +274,21 @@ def test_slopes_of_a_large_structure_are_one_function():
     main = program[program.index("ENTRY") :].splitlines()
     over_samples = [line for line in main if f"[{N},2,{D}]" in line and ("call(" in line or "while(" in line)]
     assert over_samples and all("xla_cpu_small_call" in line for line in over_samples)
+
+
+def test_a_law_is_evaluated_once_for_all_states_and_directions_that_it_moves():
+    """Counted in the compiled program: a step of order 2 evaluates a torque twice, with its derivative."""
+    joint = paper() + fx.LuGre("hub", 0.02, 0.02) + fx.Cogging("arm", 0.01, 0.01, 7.0)
+    structure, D = joint.structure, 16
+    with double_precision():
+        P, E, n = len(joint.values), len(joint.effects), Layout.of(structure).size
+        numbers = RunParameters(jnp.asarray(joint.values), jnp.ones(E), jnp.zeros(n), jnp.zeros((n, 2)))
+        directions = TangentDirections(jnp.ones((D, P)), jnp.zeros((D, E)), jnp.zeros((D, n)))
+        samples = RecordingSamples(jnp.zeros(N), jnp.zeros((N, 2)), jnp.ones(N), jnp.asarray(Ts))
+        run = jax.jit(functools.partial(outputs_with_sensitivities, structure, SOLVER))
+        program = run.lower(numbers, directions, samples).compile().as_text()
+    assert [program.count(f" {name}(") for name in ("sine", "cosine")] == [2, 2]
+    # No single loop over states and directions contains both evaluations of the friction.
+    loops = [part for part in program.split("\n\n") if f"-> f64[{n},{D}]" in part.split("\n")[0]]
+    longest = max(len(re.findall(rf"= f64\[{D}\]\S* (?:multiply|add|subtract|select)\(", x)) for x in loops)
+    assert loops and longest < 30, longest
