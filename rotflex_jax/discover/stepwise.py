@@ -145,8 +145,8 @@ def refit_candidates(
     The amplitude that the score test suggests is too large where an effect is strongly nonlinear. So a refit
     starts at the likeliest of several shares of this amplitude, and at the shape with which a few steps gain
     most. If a refit gains far less than the score test expects, it starts again from a small amplitude of
-    every shape. If it is still worse than the current model, it starts from a very small one. An effect with
-    memory replaces the simpler effect that it contains, since the two in parallel would be a third effect.
+    every shape. If it is still worse than the current model, it starts from a very small one. A refit to free
+    runs also starts from the fit of each candidate that the effect contains. An effect with memory replaces the simpler effect that it contains, since the two in parallel would be a third effect.
     """
     s = problem.supermodel
     for c in starts:
@@ -154,14 +154,15 @@ def refit_candidates(
     # Each candidate has one thread from start to end, so none waits for the slowest one after every stage.
     refitted = on_threads(lambda c: _refit_candidate(problem, current, c), starts)
     # At its optimum an effect is no worse than an effect that it contains. A refit that is worse starts again
-    # from the fit with the contained effect.
-    below = [
+    # from the fit with the contained effect. So does every refit to free runs, whose cost has many minima.
+    again = [
         (i, replacing(s, refitted[j], [b.location], a, START_SHARES[-1]))
         for i, a in enumerate(starts)
         for j, b in enumerate(starts)
-        if a.location.contains(b.location) and refitted[i].log_likelihood < refitted[j].log_likelihood
+        if a.location.contains(b.location)
+        and (problem.free_run or refitted[i].log_likelihood < refitted[j].log_likelihood)
     ]
-    return refit_from(problem, refitted, below)
+    return refit_from(problem, refitted, again)
 
 
 def _refit_candidate(problem: LikelihoodProblem, current: Hypothesis, start: CandidateStart) -> Hypothesis:
