@@ -146,7 +146,8 @@ def refit_candidates(
     starts at the likeliest of several shares of this amplitude, and at the shape with which a few steps gain
     most. If a refit gains far less than the score test expects, it starts again from a small amplitude of
     every shape. If it is still worse than the current model, it starts from a very small one. A refit to free
-    runs also starts from the fit of each candidate that the effect contains. An effect with memory replaces the simpler effect that it contains, since the two in parallel would be a third effect.
+    runs also starts from the fit of each candidate that its effect contains. An effect with memory replaces
+    the simpler effect that it contains, since the two in parallel would be a third effect.
     """
     s = problem.supermodel
     for c in starts:
