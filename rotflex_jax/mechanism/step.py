@@ -559,6 +559,7 @@ def _advance_smooth(
     z1 = advance_memories(mechanism, z, (x + end) / 2, voltage, c.gates, c.h)
     if solver.order == 2:
         f1 = torques(mechanism, end, z1, v, c.gates)
+        # Row by row: the difference of two arrays of rows would be computed with branches.
         change = jnp.stack([b - a for a, b in zip(jnp.unstack(f0), jnp.unstack(f1), strict=True)])
         final = guess + matvec(c.ramp, change)
     else:
