@@ -258,19 +258,25 @@ def test_slopes_are_those_that_jax_takes(case: str) -> None:
     np.testing.assert_allclose(got[1], J, rtol=1e-7, atol=1e-9 * np.abs(J).max())
 
 
-def test_slopes_of_a_large_structure_are_one_function():
-    """All operations over samples and 32 directions are small calls of compiled functions."""
-    if not loops_are_fast():
-        pytest.skip("XLA was started without the option for small loops")
-    joint = paper() + fx.Backlash("hub") + fx.Dahl("hub") + fx.LuGre("joint") + fx.Cogging("arm")
-    structure, D = joint.structure, 32
+def compiled_slopes(joint: Mechanism, D: int, options: dict[str, Any] | None = None) -> str:
+    """Text of the compiled program of N samples of a predictor with its sensitivities along D directions."""
+    structure = joint.structure
     with double_precision():
         P, E, n = len(joint.values), len(joint.effects), Layout.of(structure).size
         numbers = RunParameters(jnp.asarray(joint.values), jnp.ones(E), jnp.zeros(n), jnp.zeros((n, 2)))
         directions = TangentDirections(jnp.ones((D, P)), jnp.zeros((D, E)), jnp.zeros((D, n)))
         samples = RecordingSamples(jnp.zeros(N), jnp.zeros((N, 2)), jnp.ones(N), jnp.asarray(Ts))
         run = jax.jit(functools.partial(outputs_with_sensitivities, structure, SOLVER))
-        program = run.lower(numbers, directions, samples).compile(ROUGH).as_text()
+        return run.lower(numbers, directions, samples).compile(options).as_text()
+
+
+def test_slopes_of_a_large_structure_are_one_function():
+    """All operations over samples and 32 directions are small calls of compiled functions."""
+    if not loops_are_fast():
+        pytest.skip("XLA was started without the option for small loops")
+    joint = paper() + fx.Backlash("hub") + fx.Dahl("hub") + fx.LuGre("joint") + fx.Cogging("arm")
+    D = 32
+    program = compiled_slopes(joint, D, ROUGH)
     main = program[program.index("ENTRY") :].splitlines()
     over_samples = [line for line in main if f"[{N},2,{D}]" in line and ("call(" in line or "while(" in line)]
     assert over_samples and all("xla_cpu_small_call" in line for line in over_samples)
@@ -279,14 +285,8 @@ def test_slopes_of_a_large_structure_are_one_function():
 def test_a_law_is_evaluated_once_for_all_states_and_directions_that_it_moves():
     """Counted in the compiled program: a step of order 2 evaluates a torque twice, with its derivative."""
     joint = paper() + fx.LuGre("hub", 0.02, 0.02) + fx.Cogging("arm", 0.01, 0.01, 7.0)
-    structure, D = joint.structure, 16
-    with double_precision():
-        P, E, n = len(joint.values), len(joint.effects), Layout.of(structure).size
-        numbers = RunParameters(jnp.asarray(joint.values), jnp.ones(E), jnp.zeros(n), jnp.zeros((n, 2)))
-        directions = TangentDirections(jnp.ones((D, P)), jnp.zeros((D, E)), jnp.zeros((D, n)))
-        samples = RecordingSamples(jnp.zeros(N), jnp.zeros((N, 2)), jnp.ones(N), jnp.asarray(Ts))
-        run = jax.jit(functools.partial(outputs_with_sensitivities, structure, SOLVER))
-        program = run.lower(numbers, directions, samples).compile().as_text()
+    n, D = Layout.of(joint.structure).size, 16
+    program = compiled_slopes(joint, D)
     assert [program.count(f" {name}(") for name in ("sine", "cosine")] == [2, 2]
     # No single loop over states and directions contains both evaluations of the friction.
     loops = [part for part in program.split("\n\n") if f"-> f64[{n},{D}]" in part.split("\n")[0]]
