@@ -187,6 +187,7 @@ def _roughly(seconds: float) -> str:
 
 # Arrays of a hypothesis that are stored; whitener, likelihood and blocks follow from a run.
 _NUMBERS = ("z", "local_z", "x0", "K")
+_INDICES = ("free", "local", "sizes")
 
 
 def digest_of_search(
@@ -212,7 +213,8 @@ def digest_of_search(
 def kept(h: Hypothesis) -> dict[str, Any]:
     """A hypothesis in plain JSON types, with all numbers in full precision."""
     numbers = {name: getattr(h, name).tolist() for name in _NUMBERS}
-    marks = {"locations": [list(p) for p in h.locations], "free": list(h.free), "local": list(h.local)}
+    marks = {"locations": [list(p) for p in h.locations]}
+    marks |= {name: list(getattr(h, name)) for name in _INDICES}
     return {**marks, **numbers, "process_noise": dict(h.process_noise)}
 
 
@@ -224,12 +226,14 @@ def restored(problem: LikelihoodProblem, written: Mapping[str, Any]) -> Hypothes
     """
     locations = tuple(EffectLocation(*map(str, p)) for p in written["locations"])
     numbers = {name: np.array(written[name], float) for name in _NUMBERS}
+    indices = {name: tuple(map(int, written[name])) for name in _INDICES}
     h = Hypothesis(
         locations=locations,
-        free=tuple(map(int, written["free"])),
-        local=tuple(map(int, written["local"])),
+        free=indices["free"],
+        local=indices["local"],
         process_noise={str(p): float(q) for p, q in written["process_noise"].items()},
         whitener=Whitener.of_noise(problem.noise),
+        sizes=indices["sizes"],
         **numbers,
     )
     _check(problem, h)
@@ -243,6 +247,8 @@ def _check(problem: LikelihoodProblem, h: Hypothesis) -> None:
     if not set(h.locations) <= {*s.candidates, *s.calibrations} or sorted((*h.free, *h.local)) != sorted(
         (*s.baseline_free, *on)
     ):
+        raise ValueError(h)
+    if not set(h.sizes) <= set(h.local):
         raise ValueError(h)
     intensities = h.process_noise.values()
     if not set(h.process_noise) <= set(problem.ports) or not all(0 <= q < math.inf for q in intensities):

@@ -178,9 +178,9 @@ def window_sizes(
     """How consistent the sizes of effects are over the windows of some recordings.
 
     In each window the amplitudes `a` of an effect are fitted to the whitened errors `w` by one Gauss-Newton
-    step `d`. The first state and the local parameters are projected out of the slopes `J`, and all other
-    parameters are held. The scatter is the root of `sum |J d|^2 / sum |J a|^2`, the change is the root of
-    `sum |J a|^2 / sum |w|^2`. So the weight of a window is the size of what the effect does there.
+    step `d`. The first state and the other local parameters are projected out of the slopes `J`, and all
+    other parameters are held. The scatter is the root of `sum |J d|^2 / sum |J a|^2`, the change is the root
+    of `sum |J a|^2 / sum |w|^2`. So the weight of a window is the size of what the effect does there.
 
     Args:
         problem: Likelihood of free runs over the recordings.
@@ -192,7 +192,7 @@ def window_sizes(
     s, seen = problem.supermodel, problem.seen
     e, J = problem.slopes([h])
     w, W = h.whitener(e[0], seen), h.whitener(J[0, : h.moved], seen)
-    values, derivative = (x.mean(axis=0) for x in h.physical(s))
+    values, derivative = h.physical(s)
     columns = {i: k for k, i in enumerate((*h.free, *h.local))}
     found = {}
     for location in locations:
@@ -206,7 +206,7 @@ def window_sizes(
         totals = np.zeros(3)
         for r in range(len(w)):
             for _, samples in problem.windows.of(r):
-                slopes = W[moved, r, samples].reshape(len(own), -1) / derivative[own, None]
+                slopes = W[moved, r, samples].reshape(len(own), -1) / derivative[r, own, None]
                 rows = np.concatenate([slopes, w[None, r, samples].reshape(1, -1)])
                 others = W[beside, r, samples].reshape(len(beside), -1)
                 if not (np.isfinite(rows).all() and np.isfinite(others).all()):
@@ -214,7 +214,7 @@ def window_sizes(
                 rows = orthogonal_to(rows, others)
                 slopes, left = rows[:-1], rows[-1]
                 step = np.linalg.lstsq(slopes.T, left, rcond=1e-6)[0]
-                totals += [np.sum((step @ slopes) ** 2), np.sum((values[own] @ slopes) ** 2), left @ left]
+                totals += [np.sum((step @ slopes) ** 2), np.sum((values[r, own] @ slopes) ** 2), left @ left]
         wanted, acts, rest = totals
         if acts > 0 and rest > 0:
             found[location] = WindowSizes(float(np.sqrt(wanted / acts)), float(np.sqrt(acts / rest)))

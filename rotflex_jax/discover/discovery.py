@@ -66,7 +66,9 @@ class Discovery(SearchResult):
     def latent_torque(self, progress: Callable[[str], None] | None = None) -> LatentTorqueComparison:
         """Torques that the baseline and the final model lack, on a fitted and a validation recording."""
         groups = (self.train, self.validation) if self.validation != self.train else (self.train,)
-        if self.final.of_validation:  # the model has the phase that a disturbance has in the first recording
+        if any(
+            e.line for e in self.final.model.mechanism.effects
+        ):  # the model has the phase that a disturbance has in the first recording
             groups = (self.train[:1],)
         longest = [max(group, key=lambda r: r.N) for group in groups]
         return compare_latent_torques(self.baseline, self.final if self.rounds else None, longest, progress)

@@ -209,9 +209,9 @@ def evaluate(
     trained = validated.with_trained_calibrations(s)
     every = range(len(validation.problem.dataset.recordings))
     runs = free_runs(validation, [validation.model_of(trained, locations, i) for i in every])
-    of_each = (
-        [s.clean(trained.values(s)[i], locations) for i in every] if s.phased.intersection(h.local) else []
-    )
+    differ = s.phased.intersection(h.local).union(h.sizes)
+    of_each = [s.clean(trained.values(s)[i], locations) for i in every] if differ else []
+    values, names = h.values(s), s.mechanism.parameter_names
     return Stage(
         model=Model(s.clean(h.mean_values(s), locations), solver),
         estimates=estimates(problem, h),
@@ -225,6 +225,7 @@ def evaluate(
         log_likelihood=validated.log_likelihood,
         horizon="free_run" if problem.free_run else "prediction",
         of_validation=tuple(Model(m, solver) for m in of_each),
+        friction_of_runs={names[i]: tuple(values[:, i].tolist()) for i in h.sizes},
     )
 
 
@@ -395,17 +396,17 @@ class Evaluation:
             InputError: If a recording lacks a channel of the model, or moves against the signs of the model.
         """
         validation, other = horizons.free_run.validation, None
+        train = horizons.free_run.problem.dataset.recordings
+        runs = KnownRuns.of(train, validation.problem.dataset.recordings)
         if test:
             check_signs(model, test)
             problem, seconds = validation.problem, validation.window_seconds
             length = max(problem.seen.shape[1], padded_length(test))
             dataset = prepare(model, test, length=length, like=problem.dataset)
             s, solver, number = problem.supermodel, problem.predictor.solver, problem.windows.number
-            whole = LikelihoodProblem.of(s, solver, dataset, problem.ports)
+            whole = LikelihoodProblem.of(s, solver, dataset, problem.ports, runs.indices(test))
             cut = whole.of_free_runs(Windows.of_seconds(model, dataset, seconds).filled_up(number))
             other = ValidationSet(cut, seconds)
-        train = horizons.free_run.problem.dataset.recordings
-        runs = KnownRuns.of(train, validation.problem.dataset.recordings)
         return cls(validation, other, calibrate_seconds, runs)
 
     def make_ahead(self, found: ValidatedHypothesis, longest: Recording) -> None:

@@ -132,8 +132,8 @@ class _Candidate(NamedTuple):
     Attributes:
         tried: The structure fitted without the validation data. It is refused if its errors on them are too
             large.
-        fitted: The structure fitted to all recordings. Its friction may have a size for each run, unlike in
-            `tried`.
+        fitted: The structure fitted to all recordings. Its friction may have a size for each run, even if
+            not in `tried`.
         laws: Pairs of an effect that was found and the law that replaces it.
         left_out: Effects and offsets that were found and that the structure does not have.
     """
@@ -231,6 +231,7 @@ class _FinalFitBuilder:
     def tried(self, structures: Sequence[FinalStructure]) -> list[_Tried]:
         """Structures fitted to the training recordings, and validated."""
         train = self.state.problem.dataset.recordings
+        held_back = self.state.validation.problem.dataset.recordings
         parts = _without_each(train) if self.state.validation.folds else [joined(train)]
         fits = fit_structures([(structure, part) for structure in structures for part in parts])
         tried = []
@@ -238,7 +239,9 @@ class _FinalFitBuilder:
             own = fits[k * len(parts) : (k + 1) * len(parts)]
             if self.state.validation.folds:  # for each recording the fit without it
                 own = [own[i % len(parts)] for i in range(len(train))]
-            each = [one.as_hypothesis() for one in own]
+                each = [one.as_hypothesis() for one in own]
+            else:
+                each = own[0].as_hypotheses(self.runs._replace(recordings=tuple(parts[0])).indices(held_back))
             tried.append(_Tried(own, _on_validation(structure, each, self.evaluation)))
         return tried
 
@@ -330,7 +333,9 @@ class _FinalFitBuilder:
         if log_error_ratio(candidate.tried.errors, self.searched) > MOST_WORSE:
             return candidate  # it would be refused for its errors
         structure = candidate.fitted.with_own_friction()
-        if not (structure.friction and self.evaluation.runs.compared and len(self.recordings) > 1):
+        if structure.friction == candidate.fitted.structure.friction:
+            return candidate
+        if not (self.evaluation.runs.compared and len(self.recordings) > 1):
             return candidate
         self.state.say("  with friction of its own size in each run")
         (fitted,) = fit_structures([(structure, self.recordings)])
@@ -375,7 +380,7 @@ class _FinalFitBuilder:
 
     def hypotheses(self, fitted: FittedStructure, recordings: Sequence[Recording]) -> list[Hypothesis]:
         """A fit to all recordings as hypotheses: one for each recording if friction differs between runs."""
-        return fitted.as_hypotheses([self.runs.index(r) for r in recordings])
+        return fitted.as_hypotheses(self.runs.indices(recordings))
 
     def accepted(self, candidate: _Candidate) -> tuple[FinalFit, FittedStructure] | Refused:
         """The result for a candidate, with its fit; or why it is refused for its errors on validation data.

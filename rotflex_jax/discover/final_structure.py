@@ -10,9 +10,8 @@ import numpy as np
 import scipy.special
 from jaxtyping import Float
 
-from rotflex_jax.discover.hypothesis import Hypothesis, replacing, usual_start, without
+from rotflex_jax.discover.hypothesis import Hypothesis, friction_sizes, replacing, usual_start, without
 from rotflex_jax.discover.supermodel import EffectLocation, SuperModel
-from rotflex_jax.effects.base import DRY_FRICTION
 from rotflex_jax.fit.greybox import FirstState, fit
 from rotflex_jax.fit.plausibility import BEYOND_RECORDINGS
 from rotflex_jax.fit.result import Fit
@@ -82,7 +81,8 @@ class FinalStructure:
         local = [s.mechanism.parameter_names[i] for i in h.local]
         own = tuple(p for p in h.locations if p in s.calibrations and p not in on)
         local = tuple(n for n in local if n in free)
-        return cls(starts, local, own, tuple(on), h, s, window_seconds)
+        friction = tuple(n for n in local if s.mechanism.parameter_names.index(n) in h.sizes)
+        return cls(starts, local, own, tuple(on), h, s, window_seconds, friction)
 
     @property
     def solver(self) -> Solver:
@@ -135,13 +135,10 @@ class FittedStructure:
 
     def with_own_friction(self) -> FinalStructure:
         """The structure with sizes of dry friction for each recording; starts: this fit, usual values."""
-        m, sizes, this = self.fit.model.mechanism, list[str](), self.structure
-        units = {n: spec.unit for n, spec in zip(m.parameter_names, m.parameter_specifications, strict=True)}
-        for effect in [e for e in m.effects if e.law_of == DRY_FRICTION]:
-            names = [effect.full_name(amplitude) for amplitude in effect.amplitudes]
-            sizes += [n for n in names if n in m.free_names and units[n] == units[names[0]]]
-        starts = (self.fit.model, this.starts[-1])
-        return dataclasses.replace(this, starts=starts, local=(*this.local, *sizes), friction=tuple(sizes))
+        this = self.structure
+        sizes = [n for n in friction_sizes(self.fit.model.mechanism) if n not in this.local]
+        starts, friction = (self.fit.model, this.starts[-1]), (*this.friction, *sizes)
+        return dataclasses.replace(this, starts=starts, local=(*this.local, *sizes), friction=friction)
 
     def as_hypothesis(self, run: int | None = None) -> Hypothesis:
         """The fit as a hypothesis of the search, with the mean of local parameters.

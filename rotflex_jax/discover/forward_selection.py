@@ -17,16 +17,23 @@ from rotflex_jax.discover.selection import (
     replaced_by,
     validate_from_best_states,
 )
-from rotflex_jax.discover.stepwise import refit_candidates, refit_near_predictions
+from rotflex_jax.discover.stepwise import (
+    Refits,
+    refit_candidates,
+    refit_near_predictions,
+    refit_with_own_friction,
+)
 from rotflex_jax.discover.supermodel import EffectLocation
 from rotflex_jax.discover.validation import ValidatedHypothesis
+from rotflex_jax.effects import CATALOG
 from rotflex_jax.effects.base import DRY_FRICTION
 from rotflex_jax.effects.labels import law_of
 
 # Number of candidates that are refitted in a round, to which the best one of each horizon is added, and
 # largest number of rounds.
 REFITTED, ROUNDS = 4, 4
-# Number of laws of dry friction that are refitted if the first round has tried none and adds nothing.
+# Number of laws of dry friction that are refitted if the first round has tried none and adds nothing, or if
+# there are several runs. The simplest law at the same port is added to them.
 FRICTION_LAWS = 2
 
 
@@ -63,6 +70,8 @@ def score_candidates(state: SearchState) -> list[Promising]:
     if state.origin is not state.current:
         state.say("the model as it is was fitted far from the values given: candidates beside both")
         found.append(_promising(state, state.current))
+    if state.problem.several_runs:  # where friction differs between runs, its slopes with one size are small
+        found += _dry_friction(state, found)
     return [p for p in found if p.starts]
 
 
@@ -93,22 +102,36 @@ def add_dry_friction(state: SearchState, promising: Sequence[Promising]) -> bool
         state: The search with what it has found so far.
         promising: Candidates that the round has tried.
     """
+    chosen = _dry_friction(state, promising)
+    return bool(chosen) and add_best(state, chosen)
+
+
+def _dry_friction(state: SearchState, promising: Sequence[Promising]) -> list[Promising]:
+    """Laws of dry friction at the motors for the first round, if something is unexplained and none is tried.
+
+    Args:
+        state: The search with what it has found so far.
+        promising: Candidates that the round tries.
+    """
     s, tried = state.problem.supermodel, [start.location.effect for p in promising for start in p.starts]
     known = (*tried, *(e.name for e in s.baseline.effects))
     if state.scores or any(law_of(name) == DRY_FRICTION for name in known):
-        return False
+        return []
     if not is_unexplained(state.horizons, state.current):
-        return False
+        return []
     motors = {port for port in s.baseline.port_vectors if s.baseline.has_motor(port)}
     driven = motors | {e.port for e in s.baseline.effects if e.signal}
     chosen = []
     for beside in [state.origin] if state.origin is state.current else [state.origin, state.current]:
         tests = state.score_tests(beside)
         order = best_candidates(*tests, len(s.candidates))
-        laws = [p for p in order if law_of(p.effect) == DRY_FRICTION and p.port in driven][:FRICTION_LAWS]
+        laws = [p for p in order if law_of(p.effect) == DRY_FRICTION and p.port in driven]
+        # A law without states converges from far away, where others do not.
+        simplest = [p for p in laws if p.port == laws[0].port and not CATALOG[p.effect].contains]
+        laws = list(dict.fromkeys([*laws[:FRICTION_LAWS], *simplest]))
         if laws:
             chosen.append(Promising.at(beside, [test.listed for test in tests], laws))
-    return bool(chosen) and add_best(state, chosen)
+    return chosen
 
 
 def refit_and_validate(
@@ -137,6 +160,7 @@ def refit_and_validate(
     problem = horizons.free_run.problem
     runs = refit_candidates(problem, beside.free_run.hypothesis, informed)
     runs = refit_near_predictions(problem, runs, grown)
+    grown, runs = refit_with_own_friction(horizons, Refits(grown, runs), informed)
     state.say("  free runs are fitted, validation follows")
     plausible = [
         (h, f, c.location)

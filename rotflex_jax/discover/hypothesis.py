@@ -11,6 +11,7 @@ from rotflex_jax.discover.supermodel import EffectLocation, SuperModel
 from rotflex_jax.effects import CATALOG
 from rotflex_jax.effects.base import DRY_FRICTION
 from rotflex_jax.effects.labels import law_of
+from rotflex_jax.mechanism import Mechanism
 from rotflex_jax.mechanism.assembly import rest_state
 from rotflex_jax.parameters import Transform
 
@@ -91,7 +92,10 @@ class Hypothesis:
     Attributes:
         locations: Candidates and calibrations that are switched on, in the order they were added.
         free: Indices of fitted parameters that are common to all recordings.
-        local: Indices of fitted parameters that have a value for each recording (calibrations).
+        local: Indices of fitted parameters that have a value for each recording: calibrations, and sizes of
+            friction that differ between runs.
+        sizes: Those of `local` that are sizes of friction. Other recordings of a run have the size of the
+            run, while calibrations are fitted to every recording.
         z: Unconstrained values of all parameters.
         local_z: Unconstrained values of the local parameters of each recording.
         x0: First states of the windows: positions, speeds, and further states of the reduced model.
@@ -116,6 +120,7 @@ class Hypothesis:
         default_factory=lambda: np.array(-np.inf)
     )
     blocks: Float[np.ndarray, " B"] = dataclasses.field(default_factory=lambda: np.zeros(0))
+    sizes: tuple[int, ...] = ()
 
     def initial_state_for(
         self, s: SuperModel, locations: tuple[EffectLocation, ...]
@@ -231,17 +236,19 @@ def replacing(
     s: SuperModel, h: Hypothesis, simpler: Sequence[EffectLocation], start: CandidateStart, share: float
 ) -> Hypothesis:
     """The hypothesis with a richer effect that replaces simpler ones and takes over their parameters."""
-    values, known = h.mean_values(s), {}
+    values, known, of_runs = h.mean_values(s), {}, {}
     name = [full.rpartition(".")[2] for full in s.mechanism.parameter_names]  # without port and effect
     for location in simpler:
         known |= {name[i]: values[i] for i in s.parameter_indices(location)}
+        of_runs |= {name[i]: h.values(s)[:, i] for i in s.parameter_indices(location) if i in h.sizes}
         h = without(s, h, location)
     c, own = s.candidates[start.location], start.values.copy()
     for k, i in enumerate(c.parameters):
         if name[i] in known:
             # Parameters of the simpler effect keep their size; only other parameters get the share.
             own[k] = known[name[i]] / (share if c.scaled[k] else 1.0)
-    return with_effect(s, h, dataclasses.replace(start, values=own), share)
+    richer = with_effect(s, h, dataclasses.replace(start, values=own), share)
+    return with_sizes_of_runs(s, richer, {i: of_runs[name[i]] for i in c.parameters if name[i] in of_runs})
 
 
 def with_effect(s: SuperModel, h: Hypothesis, start: CandidateStart, share: float) -> Hypothesis:
@@ -285,6 +292,46 @@ def without(s: SuperModel, h: Hypothesis, location: EffectLocation) -> Hypothesi
         free=tuple(i for i in h.free if i not in removed),
         local=tuple(h.local[k] for k in kept),
         local_z=h.local_z[:, kept],
+        sizes=tuple(i for i in h.sizes if i not in removed),
+    )
+
+
+def friction_sizes(m: Mechanism) -> list[str]:
+    """Names of free sizes of dry friction: amplitudes of each law that have the unit of its first one."""
+    units = {n: spec.unit for n, spec in zip(m.parameter_names, m.parameter_specifications, strict=True)}
+    found = []
+    for effect in [e for e in m.effects if e.law_of == DRY_FRICTION]:
+        names = [effect.full_name(amplitude) for amplitude in effect.amplitudes]
+        found += [n for n in names if n in m.free_names and units[n] == units[names[0]]]
+    return found
+
+
+def with_own_friction(s: SuperModel, h: Hypothesis, location: EffectLocation) -> Hypothesis:
+    """The hypothesis with sizes of an effect for each recording; itself unless the effect is dry friction."""
+    names = set(friction_sizes(s.mechanism))
+    indices = [i for i in s.parameter_indices(location) if s.mechanism.parameter_names[i] in names]
+    values = h.values(s)
+    return with_sizes_of_runs(s, h, {i: values[:, i] for i in indices if i in h.free})
+
+
+def with_sizes_of_runs(s: SuperModel, h: Hypothesis, sizes: dict[int, Float[np.ndarray, " R"]]) -> Hypothesis:
+    """The hypothesis with a size of friction for each recording, in the place of one for all.
+
+    Args:
+        s: The super-model.
+        h: The hypothesis.
+        sizes: Index of a parameter -> its value in each recording.
+    """
+    if not sizes:
+        return h
+    specs = [s.mechanism.parameter_specifications[i] for i in sizes]
+    own = Transform.of(specs).unconstrain(np.stack(list(sizes.values()), axis=1))
+    return dataclasses.replace(
+        h,
+        free=tuple(i for i in h.free if i not in sizes),
+        local=(*h.local, *sizes),
+        local_z=np.hstack([h.local_z, own]),
+        sizes=(*h.sizes, *sizes),
     )
 
 
@@ -310,13 +357,16 @@ def handed_over(s: SuperModel, h: Hypothesis, location: EffectLocation) -> Hypot
     law = law_with_its_size(h.locations, location)
     if law is None:
         return None
-    less, values = without(s, h, location), h.mean_values(s)
-    z, index = less.z.copy(), s.mechanism.parameter_names.index
+    less, values = without(s, h, location), h.values(s)
+    z, local_z, index = less.z.copy(), less.local_z.copy(), s.mechanism.parameter_names.index
     for name in _common_sizes(law, location):
         i, given = index(law.full_name(name)), index(location.full_name(name))
-        total = np.array([values[i] + values[given]])
-        z[i] = Transform.of([s.mechanism.parameter_specifications[i]]).unconstrain(total)[0]
-    return dataclasses.replace(less, z=z)
+        transform = Transform.of([s.mechanism.parameter_specifications[i]])
+        total = (values[:, i] + values[:, given])[:, None]
+        z[i] = transform.unconstrain(total.mean(axis=0))[0]
+        if i in less.local:
+            local_z[:, less.local.index(i)] = transform.unconstrain(total)[:, 0]
+    return dataclasses.replace(less, z=z, local_z=local_z)
 
 
 def with_all_calibrations(s: SuperModel, h: Hypothesis) -> Hypothesis:
@@ -340,9 +390,11 @@ def parameter_count(s: SuperModel, h: Hypothesis, location: EffectLocation) -> i
 
 def is_physical(s: SuperModel, h: Hypothesis, location: EffectLocation) -> bool:
     """Whether all parameters of an effect lie in their physical ranges."""
-    values, specs = h.mean_values(s), s.mechanism.parameter_specifications
+    values, specs = h.values(s), s.mechanism.parameter_specifications
     return all(
-        specs[i].physical[0] <= values[i] <= specs[i].physical[1] for i in s.parameter_indices(location)
+        specs[i].physical[0] <= value <= specs[i].physical[1]
+        for i in s.parameter_indices(location)
+        for value in values[:, i]
     )
 
 

@@ -8,6 +8,7 @@ are judged by their scatter between blocks of time.
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -22,6 +23,7 @@ from rotflex_jax.mechanism import Solver, kalman_gains
 from rotflex_jax.mechanism.assembly import Layout
 from rotflex_jax.mechanism.finer_step import with_finer_steps
 from rotflex_jax.optimise.damped_least_squares import LARGEST_STEP, NormalEquations, Rules, minimise
+from rotflex_jax.recording.recording import of_one_run
 from rotflex_jax.runtime.persistent_jit import make_ahead
 from rotflex_jax.runtime.xla import on_threads
 
@@ -46,6 +48,8 @@ class LikelihoodProblem:
         ports: Ports at which process noise acts.
         windows: Windows at whose beginnings runs start again.
         free_run: Whether runs are free runs, in which no measurement corrects the state.
+        trained: For each recording, the index of the training recording of the same run, or None; empty for
+            training recordings.
     """
 
     predictor: BatchedPredictor
@@ -53,6 +57,7 @@ class LikelihoodProblem:
     ports: tuple[str, ...]
     windows: Windows
     free_run: bool = False
+    trained: tuple[int | None, ...] = ()
 
     @classmethod
     def of(
@@ -61,10 +66,11 @@ class LikelihoodProblem:
         solver: Solver,
         dataset: Dataset,
         ports: tuple[str, ...],
+        trained: tuple[int | None, ...] = (),
     ) -> "LikelihoodProblem":
         """The one-step prediction of a dataset by a super-model."""
         predictor = BatchedPredictor(supermodel, solver, dataset.data, dataset.constants)
-        return cls(predictor, dataset, ports, Windows.whole(dataset))
+        return cls(predictor, dataset, ports, Windows.whole(dataset), trained=trained)
 
     def of_free_runs(self, windows: Windows) -> "LikelihoodProblem":
         """The likelihood of free runs over windows, with the same compiled programs."""
@@ -109,6 +115,19 @@ class LikelihoodProblem:
     def measured_values(self) -> float:
         """Number of measured values that count."""
         return float(np.sum(self.seen)) * self.dataset.data.y.shape[-1]
+
+    @functools.cached_property
+    def several_runs(self) -> bool:
+        """Whether the recordings are of more than one run."""
+        first, *others = self.dataset.recordings
+        return not all(of_one_run(first, other) for other in others)
+
+    @property
+    def block_counts(self) -> list[int]:
+        """Number of blocks of each recording."""
+        data = self.dataset.data
+        counts = (int(n) for n in data.seen.sum(axis=1))
+        return [len(block_edges(n, float(Ts))) if n else 0 for n, Ts in zip(counts, data.Ts, strict=True)]
 
     @property
     def direction_count(self) -> int:

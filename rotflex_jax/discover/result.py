@@ -125,7 +125,9 @@ class Stage:
             `calibrate_seconds`.
         calibrate_seconds: Length of the part of a recording to which its own offsets are fitted [s].
         of_validation: The model for each validation recording, with the phase of a periodic disturbance
-            there; empty without a disturbance.
+            there and with the friction of its run; empty without either.
+        friction_of_runs: Sizes of friction that differ between the training recordings: name -> value in each
+            of them.
     """
 
     model: Model
@@ -144,6 +146,7 @@ class Stage:
     test_calibrated: RunErrors | None = None
     calibrate_seconds: float = 0.0
     of_validation: tuple[Model, ...] = ()
+    friction_of_runs: dict[str, tuple[float, ...]] = dataclasses.field(default_factory=dict)
 
     def model_on(self, i: int) -> Model:
         """The model for validation recording `i`."""
@@ -203,6 +206,10 @@ class KnownRuns(NamedTuple):
 
         of_run = [k for k, r in enumerate(self.recordings) if of_one_run(r, recording)]
         return max(of_run, key=shared, default=None)
+
+    def indices(self, recordings: Sequence[Recording]) -> tuple[int | None, ...]:
+        """`index` of each recording."""
+        return tuple(map(self.index, recordings))
 
 
 def _parameters(estimates: Sequence[Estimate]) -> dict[str, Any]:
@@ -541,11 +548,11 @@ class SearchResult:
         return self.final_fit.model if self.final_fit else self.final.model
 
     def model_of(self, recording: Recording) -> Model:
-        """The model to use for a recording: `model` with the offsets that are known of its run.
+        """The model to use for a recording: `model` with the offsets and the friction known of its run.
 
-        If the recording belongs to a run that was fitted, the model has the offsets of that run. If it
-        belongs to another run, the model lacks offsets that were seen in a single run only. Offsets that the
-        final fit leaves out are in no model.
+        If the recording belongs to a run that was fitted, the model has the offsets of that run, and its
+        friction where this differs between runs. If it belongs to another run, the model lacks offsets that
+        were seen in a single run only. Offsets that the final fit leaves out are in no model.
 
         Args:
             recording: Any recording of this machine; a part of a recording belongs to the run of the whole.
@@ -562,6 +569,8 @@ class SearchResult:
                 return fit.model_of(k)
             own = {name: each[k].value for name, each in fit.local.items() if name in m.parameter_names}
             m = m.with_values(own)
+        elif k is not None:
+            m = m.with_values({name: each[k] for name, each in self.final.friction_of_runs.items()})
         return dataclasses.replace(self.model, mechanism=m)
 
     @property
@@ -619,6 +628,7 @@ class SearchResult:
             "noise_floor": json_numbers(self.noise_floor),
             "rounds": [r.to_dict() for r in self.rounds],
             "parameters": _parameters(self.final.estimates),
+            "friction_of_runs": {name: list(each) for name, each in self.final.friction_of_runs.items()},
             "ranking": [r.to_dict() for r in self.ranking],
             "where": [w.to_dict() for w in self.where],
             "next_experiment": self.proposal.to_dict(NEXT) if self.proposal else None,

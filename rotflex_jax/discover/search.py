@@ -27,7 +27,7 @@ from rotflex_jax.discover.likelihood import (
     finer_integration,
 )
 from rotflex_jax.discover.pairs import pairs_passed_by
-from rotflex_jax.discover.result import longest_recording
+from rotflex_jax.discover.result import KnownRuns, longest_recording
 from rotflex_jax.discover.search_state import Progress, SearchState, as_it_was, fit_as_it_is
 from rotflex_jax.discover.selection import is_poor
 from rotflex_jax.discover.stepwise import (
@@ -221,7 +221,8 @@ def _prepare(
     # compiled once for both.
     length = max(padded_length(train), padded_length(held_back))
     of_validation = prepare(model, held_back, length=length, like=dataset)
-    other = LikelihoodProblem.of(supermodel, solver, of_validation, ports)
+    runs = KnownRuns.of(train, held_back)
+    other = LikelihoodProblem.of(supermodel, solver, of_validation, ports, runs.indices(held_back))
     return Horizons.of(model, problem, other, window_seconds)
 
 

@@ -19,6 +19,7 @@ from rotflex_jax.discover.hypothesis import (
     usual_start,
     with_candidate,
     with_effect,
+    with_own_friction,
     without,
 )
 from rotflex_jax.discover.likelihood import (
@@ -31,6 +32,7 @@ from rotflex_jax.discover.likelihood import (
 from rotflex_jax.discover.selection import (
     FREE_RUN_BETTER,
     FREE_RUN_Z,
+    SUPPORT_Z,
     TRAIN_Z,
     WINDOWS_BETTER,
     distinguished,
@@ -154,10 +156,19 @@ def refit_candidates(
         make_ahead(problem.slopes, [with_candidate(s, current, c, START_SHARES[0])])
     # Each candidate has one thread from start to end, so none waits for the slowest one after every stage.
     refitted = on_threads(lambda c: _refit_candidate(problem, current, c), starts)
-    # At its optimum an effect is no worse than an effect that it contains. A refit that is worse starts again
-    # from the fit with the contained effect. So does every refit to free runs, whose cost has many minima.
+    return _refit_from_contained(problem, refitted, starts)
+
+
+def _refit_from_contained(
+    problem: LikelihoodProblem, refitted: list[Hypothesis], starts: Sequence[CandidateStart]
+) -> list[Hypothesis]:
+    """Refits repeated from the fits of the candidates that their effects contain; the likelier is kept.
+
+    At its optimum an effect is no worse than an effect that it contains. A refit that is worse starts again
+    from the fit with the contained effect. So does every refit to free runs, whose cost has many minima.
+    """
     again = [
-        (i, replacing(s, refitted[j], [b.location], a, START_SHARES[-1]))
+        (i, replacing(problem.supermodel, refitted[j], [b.location], a, START_SHARES[-1]))
         for i, a in enumerate(starts)
         for j, b in enumerate(starts)
         if a.location.contains(b.location)
@@ -216,6 +227,55 @@ def refit_near_predictions(
     """
     begun = enumerate(on_threads(lambda h: as_free_run(problem, h), predictions))
     return refit_from(problem, refitted, [(i, h) for i, h in begun if np.isfinite(h.log_likelihood)])
+
+
+class Refits(NamedTuple):
+    """Models with one candidate each, in the same order at both horizons.
+
+    Attributes:
+        predictions: The models fitted to predictions.
+        free_runs: The models fitted to free runs.
+    """
+
+    predictions: list[Hypothesis]
+    free_runs: list[Hypothesis]
+
+
+def refit_with_own_friction(horizons: Horizons, refits: Refits, starts: Sequence[CandidateStart]) -> Refits:
+    """Refits of friction repeated with a size for each recording, where all runs are clearly better so.
+
+    Friction changes with temperature, wear and load, so it may differ between runs. One size for all of them
+    may then fit no run, and the friction would be refused. A single run cannot show such a difference.
+
+    Args:
+        horizons: Training recordings at both horizons.
+        refits: Models with one candidate each.
+        starts: The candidate of each model, with its start of a refit to free runs.
+    """
+    prediction, free_run = horizons.prediction.problem, horizons.free_run.problem
+    if not free_run.several_runs:
+        return refits
+    s, kept = free_run.supermodel, Refits(list(refits.predictions), list(refits.free_runs))
+    own = [with_own_friction(s, h, c.location) for h, c in zip(refits.free_runs, starts, strict=True)]
+    asked = [k for k, h in enumerate(own) if h.sizes != refits.free_runs[k].sizes]
+    fitted = refit(free_run, [own[k] for k in asked])
+    fitted = _refit_from_contained(free_run, fitted, [starts[k] for k in asked])
+    taken = {
+        k: h for k, h in zip(asked, fitted, strict=True) if _better_in_each(free_run, h, refits.free_runs[k])
+    }
+    again = [with_own_friction(s, refits.predictions[k], starts[k].location) for k in taken]
+    for (k, h), prediction_fit in zip(taken.items(), refit(prediction, again), strict=True):
+        kept.predictions[k], kept.free_runs[k] = prediction_fit, h
+    return kept
+
+
+def _better_in_each(problem: LikelihoodProblem, h: Hypothesis, other: Hypothesis) -> bool:
+    """Whether free runs are clearly better with a hypothesis than with another one, in each recording too."""
+    gain, z = paired_gain(h.blocks, other.blocks)
+    ends = np.cumsum(problem.block_counts)[:-1]
+    each = zip(*(np.split(x.blocks, ends) for x in (h, other)), strict=True)
+    better = gain / len(h.blocks) > FREE_RUN_BETTER and z > FREE_RUN_Z
+    return better and all(paired_gain(*blocks)[1] > SUPPORT_Z for blocks in each)
 
 
 class Eliminated(NamedTuple):
@@ -596,6 +656,17 @@ def calibration_notes(
                 )
             )
     return tuple(out)
+
+
+def own_friction_notes(s: SuperModel, h: Hypothesis) -> tuple[str, ...]:
+    """Sentences on sizes of friction that differ between the training runs, with their values."""
+    names, specs, values = s.mechanism.parameter_names, s.mechanism.parameter_specifications, h.values(s)
+    return tuple(
+        f"{names[i]} differs between the training recordings: "
+        + ", ".join(f"{v:.3g} {specs[i].unit}" for v in values[:, i])
+        + "; other parts of these runs get the value of their run, other runs the mean."
+        for i in h.sizes
+    )
 
 
 def disturbance_notes(s: SuperModel, final: ValidatedHypothesis) -> tuple[str, ...]:

@@ -43,6 +43,7 @@ from rotflex_jax.discover.stepwise import (
     disturbance_notes,
     far_from_given,
     nested_models,
+    own_friction_notes,
     refit_without,
     titled,
 )
@@ -159,6 +160,7 @@ def conclude(state: SearchState, evaluated: EvaluatedModels, started: float) -> 
             *conditional_note(conditional),
             *calibration_notes(supermodel, evaluated.final, state.own, used.mechanism),
             *_run_notes(state, evaluated.test),
+            *own_friction_notes(supermodel, evaluated.final.hypothesis),
             *disturbance_notes(supermodel, evaluated.final),
             *difference_notes(supermodel, evaluated.pairs),
             *_far_baseline(state),

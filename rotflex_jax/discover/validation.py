@@ -138,7 +138,8 @@ class ValidatedHypothesis:
     def with_trained_calibrations(self, s: SuperModel) -> Hypothesis:
         """The hypothesis on the validation recordings, with the mean calibrations of training recordings.
 
-        The phase of a periodic disturbance keeps its adapted value, since recordings never share it.
+        The phase of a periodic disturbance keeps its adapted value, since recordings never share it. Friction
+        keeps the size of the run.
 
         Args:
             s: The super-model of the hypothesis.
@@ -149,7 +150,7 @@ class ValidatedHypothesis:
             local_z[:, len(self.hypothesis.free) :] = trained
         else:
             local_z = np.tile(self.hypothesis.local_z.mean(axis=0), (len(self.adapted.x0), 1))
-        own = [k for k, i in enumerate(self.adapted.local) if i in s.phased]
+        own = [k for k, i in enumerate(self.adapted.local) if i in s.phased or i in self.adapted.sizes]
         local_z[:, own] = self.adapted.local_z[:, own]
         return dataclasses.replace(self.adapted, local_z=local_z)
 
@@ -303,12 +304,20 @@ class _OwnStep(NamedTuple):
 
 
 def carried_over(problem: LikelihoodProblem, h: Hypothesis) -> Hypothesis:
-    """A trained hypothesis on other recordings, with measured first states and the mean calibrations."""
+    """A trained hypothesis on other recordings, with measured first states and the mean calibrations.
+
+    Friction that differs between runs has the size of the run, or the mean for a run that was not trained.
+    """
     first = problem.windows.first_states
+    local_z = np.tile(h.local_z.mean(axis=0), (len(first), 1))
+    sizes = [h.local.index(i) for i in h.sizes]
+    for own, k in zip(local_z, problem.trained, strict=False):
+        if k is not None:
+            own[sizes] = h.local_z[k, sizes]
     start = dataclasses.replace(
         h,
         x0=embed_initial_state(problem.supermodel, h.locations, first),
-        local_z=np.tile(h.local_z.mean(axis=0), (len(first), 1)),
+        local_z=local_z,
         K=np.zeros((len(first), *h.K.shape[1:])),
         densities=np.array(-np.inf),
     )
@@ -359,20 +368,22 @@ def validate(
 def adapted_to_recordings(
     problem: LikelihoodProblem, h: Hypothesis, prior: Float[np.ndarray, " R"] | None = None
 ) -> Hypothesis:
-    """The hypothesis with first states and local parameters fitted to each recording.
+    """The hypothesis with first states and calibrations fitted to each recording.
 
     The recordings are independent problems, but one call of the predictor evaluates all of them.
 
     Args:
         problem: Likelihood of the recordings.
         h: Hypothesis from which the fit starts.
-        prior: Weight, for each recording, of the sum of squares of its local parameters in unconstrained
+        prior: Weight, for each recording, of the sum of squares of its calibrations in unconstrained
             coordinates, where the unit is their usual size; zero if None.
     """
     seen, first = problem.seen, len(h.free)
     weight = np.zeros(len(h.x0)) if prior is None else prior
     coordinates = FitCoordinates(0, len(h.local), h.x0.shape[-1], problem.windows)
     own = [coordinates.of_recording(r) for r in range(len(h.x0))]
+    held = [h.local.index(i) for i in h.sizes]
+    fitted = [k for k in range(len(h.local)) if k not in held]
 
     def joined(points: list[_OwnStep]) -> Hypothesis:
         step = np.zeros(coordinates.size)
@@ -392,10 +403,11 @@ def adapted_to_recordings(
         for p in points:
             r, row = p.recording, own[p.recording]
             gradient, curvature = g[row], H[np.ix_(row, row)]
-            each = np.arange(len(h.local))
-            gradient[each] += weight[r] * here.local_z[r]
-            curvature[each, each] += weight[r]
-            cost = 0.5 * float(np.sum(w[r] ** 2) + weight[r] * np.sum(here.local_z[r] ** 2))
+            gradient[fitted] += weight[r] * here.local_z[r, fitted]
+            curvature[fitted, fitted] += weight[r]
+            gradient[held], curvature[held], curvature[:, held] = 0.0, 0.0, 0.0
+            curvature[held, held] = 1.0
+            cost = 0.5 * float(np.sum(w[r] ** 2) + weight[r] * np.sum(here.local_z[r, fitted] ** 2))
             equations.append(NormalEquations(np.array([cost]), gradient, curvature))
         return equations
 

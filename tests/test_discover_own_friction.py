@@ -1,0 +1,173 @@
+"""Friction of its own size in each run: found where the runs differ, and kept for other parts of a run.
+
+The recordings come from a separate simulator, in which friction really sticks.
+"""
+
+import dataclasses
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+import small_problem as sp
+
+import rotflex_jax as rf
+import rotflex_jax.effects as fx
+from rotflex_jax.arena.simulator.records import make_record
+from rotflex_jax.discover.checkpoint import kept, restored
+from rotflex_jax.discover.hypothesis import (
+    CandidateStart,
+    Hypothesis,
+    handed_over,
+    usual_start,
+    with_candidate,
+    with_effect,
+    with_own_friction,
+    without,
+)
+from rotflex_jax.discover.likelihood import LikelihoodProblem, refit
+from rotflex_jax.discover.stepwise import Refits, fit_baseline, refit_candidates, refit_with_own_friction
+from rotflex_jax.discover.supermodel import EffectLocation
+from rotflex_jax.discover.validation import Horizons, adapted_to_recordings, as_free_run, carried_over
+from rotflex_jax.models.model import Model
+from rotflex_jax.recording import Recording
+
+COULOMB, LUGRE, STRIBECK = (EffectLocation(name, "hub") for name in ("coulomb", "lugre", "stribeck"))
+WANTED = [(fx.Coulomb, "hub"), (fx.LuGre, "hub"), (fx.Stribeck, "hub")]
+LEVEL = "hub.coulomb.level"
+LEVELS = (0.012, 0.04)
+
+
+def runs_with(levels: tuple[float, ...], seconds: float = 4.0) -> tuple[Recording, ...]:
+    """Runs of one machine whose Coulomb friction at the hub has another level in each run."""
+    return sp.recordings(
+        tuple(
+            make_record(
+                {COULOMB: {"level": level}}, seed=31 + k, seconds=seconds, fs=400.0, perturb=0.0, rms=1.5
+            )
+            for k, level in enumerate(levels)
+        )
+    )
+
+
+class Fitted(NamedTuple):
+    """Models of two runs with Coulomb friction, one level for both; and after the test for own levels."""
+
+    problem: LikelihoodProblem
+    shared: Refits
+    own: Refits
+
+
+def fitted(levels: tuple[float, float]) -> Fitted:
+    found = runs_with(levels)
+    problem = sp.problem(found, sp.supermodel_of(WANTED, found))
+    horizons = Horizons.of(Model(sp.baseline(), sp.SOLVER), problem, None, 1.0)
+    prediction, free = horizons.prediction.problem, horizons.free_run.problem
+    beside = fit_baseline(prediction)
+    (runs,) = refit(free, [as_free_run(free, beside)])
+    start = usual_start(problem.supermodel, COULOMB)
+    shared = Refits(refit_candidates(prediction, beside, [start]), refit_candidates(free, runs, [start]))
+    return Fitted(prediction, shared, refit_with_own_friction(horizons, shared, [start]))
+
+
+@pytest.fixture(scope="module")
+def differ() -> Fitted:
+    return fitted(LEVELS)
+
+
+def levels_of(problem: LikelihoodProblem, h: Hypothesis) -> np.ndarray:
+    s = problem.supermodel
+    return h.values(s)[:, s.mechanism.parameter_names.index(LEVEL)]
+
+
+def test_each_run_has_its_own_friction_where_the_runs_differ(differ: Fitted):
+    (prediction,), (free_run,) = differ.own
+    (shared,) = differ.shared.free_runs
+    assert LEVELS[0] * 1.2 < levels_of(differ.problem, shared)[0] < LEVELS[1] / 1.2
+    for h in (prediction, free_run):
+        np.testing.assert_allclose(levels_of(differ.problem, h), LEVELS, rtol=0.1)
+
+
+def test_runs_that_agree_have_one_friction():
+    same = fitted((LEVELS[0], LEVELS[0]))
+    assert same.own.free_runs[0] is same.shared.free_runs[0]
+    assert same.own.predictions[0] is same.shared.predictions[0]
+
+
+def test_another_part_of_a_run_has_the_friction_of_the_run(differ: Fitted):
+    """An unknown run has the mean. Calibrations are fitted to the recordings, and the friction is not."""
+    (h,) = differ.own.predictions
+    problem = dataclasses.replace(differ.problem, trained=(1, None))
+    other = carried_over(problem, h)
+    own = levels_of(problem, h)
+    column = h.local.index(problem.supermodel.mechanism.parameter_names.index(LEVEL))
+    np.testing.assert_allclose(levels_of(problem, other)[0], own[1], rtol=1e-12)
+    np.testing.assert_allclose(other.local_z[1, column], h.local_z[:, column].mean(), rtol=1e-12)
+    start = dataclasses.replace(other, local_z=other.local_z + 0.1 * (np.arange(len(h.local)) != column))
+    adapted = adapted_to_recordings(problem, start)
+    np.testing.assert_array_equal(levels_of(problem, adapted), levels_of(problem, other))
+    assert np.all(np.delete(adapted.local_z - start.local_z, column, axis=1) != 0)
+
+
+def with_levels(s, *locations: EffectLocation) -> Hypothesis:
+    """The baseline with effects whose levels are 0.01; those of the first are 0.03 in the second run."""
+    h = sp.unfitted(s)
+    for location in locations:
+        start = usual_start(s, location)
+        h = with_effect(s, h, dataclasses.replace(start, values=np.r_[0.01, start.values[1:]]), 1.0)
+    own = with_own_friction(s, h, locations[0])
+    return dataclasses.replace(own, local_z=own.local_z + np.log([[1.0], [3.0]]))
+
+
+@pytest.fixture(scope="module")
+def supermodel():
+    return sp.supermodel_of(WANTED, sp.recordings(sp.records(0.0)))
+
+
+def test_a_richer_law_takes_over_the_size_of_each_run(supermodel):
+    s = supermodel
+    h = with_levels(s, COULOMB)
+    assert [s.mechanism.parameter_names[i] for i in h.sizes] == [LEVEL]
+    richer = with_candidate(s, h, usual_start(s, LUGRE), 0.5)
+    assert LUGRE in richer.locations and COULOMB not in richer.locations
+    assert [s.mechanism.parameter_names[i] for i in richer.sizes] == ["hub.lugre.level"]
+    own = richer.values(s)[:, s.mechanism.parameter_names.index("hub.lugre.level")]
+    np.testing.assert_allclose(own, [0.01, 0.03], rtol=1e-9)
+    bare = without(s, richer, LUGRE)
+    assert not bare.sizes and not bare.local and bare.local_z.shape == (2, 0)
+
+
+def test_friction_that_is_handed_over_adds_to_the_size_of_each_run(supermodel):
+    s = supermodel
+    h = handed_over(s, with_levels(s, STRIBECK, COULOMB), COULOMB)
+    assert h is not None
+    own = h.values(s)[:, s.mechanism.parameter_names.index("hub.stribeck.level")]
+    np.testing.assert_allclose(own, [0.02, 0.04], rtol=1e-9)
+
+
+def test_a_stopped_search_keeps_the_sizes_of_runs(differ: Fitted):
+    (h,) = differ.own.predictions
+    again = restored(differ.problem, kept(h))
+    assert again.sizes == h.sizes and again.local == h.local
+    np.testing.assert_array_equal(again.local_z, h.local_z)
+
+
+def test_a_search_on_runs_with_different_friction():
+    """Fitted to the beginnings of both runs, friction of the right size in each predicts their ends."""
+    parts = [r.split(0.6) for r in runs_with(LEVELS, seconds=6.0)]
+    train, validation = zip(*parts, strict=True)
+    joint = rf.Model(sp.baseline(), sp.SOLVER)
+    found = rf.discover(joint, train, validation, candidates=[*WANTED[:1], (fx.Gravity, "hub")], rounds=1)
+    assert [r.effect for r in found.rounds] == ["coulomb"]
+    note = next(e.note for e in found.final.estimates if e.name == LEVEL)
+    assert note.startswith("mean of ")
+    np.testing.assert_allclose([float(v) for v in note.removeprefix("mean of ").split(",")], LEVELS, rtol=0.1)
+    assert any(n.startswith(f"{LEVEL} differs between the training recordings: ") for n in found.notes)
+    run = found.model_of(validation[1]).mechanism.named_values[LEVEL]
+    assert run == found.to_dict()["friction_of_runs"][LEVEL][1] == pytest.approx(LEVELS[1], rel=0.1)
+    errors = np.array(list(found.final.held_out_rmse_windows.values()))
+    assert np.all(errors < 1.3 * sp.NOISE)
+
+
+def test_friction_of_runs_needs_a_law_of_friction(supermodel):
+    h = with_effect(supermodel, sp.unfitted(supermodel), CandidateStart(COULOMB, np.array([0.02])), 1.0)
+    assert with_own_friction(supermodel, h, EffectLocation("voltage_offset", "input")) is h
