@@ -231,7 +231,6 @@ class _FinalFitBuilder:
     def tried(self, structures: Sequence[FinalStructure]) -> list[_Tried]:
         """Structures fitted to the training recordings, and validated."""
         train = self.state.problem.dataset.recordings
-        held_back = self.state.validation.problem.dataset.recordings
         parts = _without_each(train) if self.state.validation.folds else [joined(train)]
         fits = fit_structures([(structure, part) for structure in structures for part in parts])
         tried = []
@@ -241,6 +240,7 @@ class _FinalFitBuilder:
                 own = [own[i % len(parts)] for i in range(len(train))]
                 each = [one.as_hypothesis() for one in own]
             else:
+                held_back = self.state.validation.problem.dataset.recordings
                 each = own[0].as_hypotheses(self.runs._replace(recordings=tuple(parts[0])).indices(held_back))
             tried.append(_Tried(own, _on_validation(structure, each, self.evaluation)))
         return tried
