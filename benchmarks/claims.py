@@ -321,6 +321,7 @@ MEASURED_DIRECTIONS = {
     "bam_xl330: gains 100 to 400 to gain 800": "XL-330, gains 100 to 400 to gain 800",
     "bam_xl330: gain 800 to gains 100 to 400": "XL-330, gain 800 to gains 100 to 400",
     "so101: random motion to steps": "SO-101, elbow, random motion to steps",
+    "so101: steps to random motion": "SO-101, elbow, steps to random motion",
 }
 """Directions in the table of the model to use -> their labels there."""
 _OF_STAGES = {
