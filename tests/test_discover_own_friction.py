@@ -168,6 +168,18 @@ def test_a_search_on_runs_with_different_friction():
     assert np.all(errors < 1.3 * sp.NOISE)
 
 
+def test_friction_of_the_users_model_may_differ_between_runs_too():
+    """The user has added what a search has found. Nothing else is missing, and the ends of the runs fit."""
+    parts = [r.split(0.6) for r in runs_with(LEVELS, seconds=6.0)]
+    train, validation = zip(*parts, strict=True)
+    joint = rf.Model(sp.baseline() + fx.Coulomb("hub", level=0.02), sp.SOLVER)
+    found = rf.discover(joint, train, validation, candidates=[(fx.Gravity, "hub")], rounds=1)
+    assert not found.rounds
+    np.testing.assert_allclose(found.baseline.friction_of_runs[LEVEL], LEVELS, rtol=0.1)
+    errors = np.array(list(found.baseline.held_out_rmse_windows.values()))
+    assert np.all(errors < 1.3 * sp.NOISE)
+
+
 def test_friction_of_runs_needs_a_law_of_friction(supermodel):
     h = with_effect(supermodel, sp.unfitted(supermodel), CandidateStart(COULOMB, np.array([0.02])), 1.0)
     assert with_own_friction(supermodel, h, EffectLocation("voltage_offset", "input")) is h

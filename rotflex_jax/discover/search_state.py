@@ -29,7 +29,13 @@ from rotflex_jax.discover.reading import (
 from rotflex_jax.discover.result import HorizonGain
 from rotflex_jax.discover.score_test import PairScore, Score, ScoreTest, residual_lines, score_test
 from rotflex_jax.discover.selection import best_window_rmse, runs_clearly_better
-from rotflex_jax.discover.stepwise import as_given, far_from_given, fit_baseline, fit_free_run_baseline
+from rotflex_jax.discover.stepwise import (
+    as_given,
+    baseline_with_own_friction,
+    far_from_given,
+    fit_baseline,
+    fit_free_run_baseline,
+)
 from rotflex_jax.discover.supermodel import EffectLocation
 from rotflex_jax.discover.validation import (
     Horizons,
@@ -262,7 +268,8 @@ def fit_as_it_is(model: Model, horizons: Horizons, say: Progress, digest: str) -
     """The state at the start of a search: the user's model, fitted and validated."""
     say(beginning("baseline", "fitting the model as it is"))
     h = fit_baseline(horizons.prediction.problem)
-    current = horizons.validated(h, fit_free_run_baseline(horizons.free_run.problem, h))
+    runs = fit_free_run_baseline(horizons.free_run.problem, h)
+    current = horizons.validated(*baseline_with_own_friction(horizons, h, runs))
     state = SearchState(model, horizons, say, current, digest, passed=[current], tried=[current])
     state.reached("as it is")
     _check_baseline(state)

@@ -51,6 +51,7 @@ from rotflex_jax.discover.validation import (
     validate,
 )
 from rotflex_jax.effects import CATALOG
+from rotflex_jax.effects.base import DRY_FRICTION
 from rotflex_jax.mechanism import Mechanism
 from rotflex_jax.mechanism.assembly import Layout
 from rotflex_jax.runtime.persistent_jit import make_ahead
@@ -267,6 +268,24 @@ def refit_with_own_friction(horizons: Horizons, refits: Refits, starts: Sequence
     for (k, h), prediction_fit in zip(taken.items(), refit(prediction, again), strict=True):
         kept.predictions[k], kept.free_runs[k] = prediction_fit, h
     return kept
+
+
+def baseline_with_own_friction(
+    horizons: Horizons, prediction: Hypothesis, free_run: Hypothesis
+) -> tuple[Hypothesis, Hypothesis]:
+    """The user's model with friction of its own size in each recording (`refit_with_own_friction`).
+
+    Args:
+        horizons: Training recordings at both horizons.
+        prediction: The user's model fitted to predictions.
+        free_run: The user's model fitted to free runs.
+    """
+    laws = [e for e in horizons.prediction.problem.supermodel.baseline.effects if e.law_of == DRY_FRICTION]
+    refits = Refits([prediction], [free_run])
+    for effect in laws:
+        start = CandidateStart(EffectLocation(effect.name, effect.at), np.zeros(0))
+        refits = refit_with_own_friction(horizons, refits, [start])
+    return refits.predictions[0], refits.free_runs[0]
 
 
 def _better_in_each(problem: LikelihoodProblem, h: Hypothesis, other: Hypothesis) -> bool:
