@@ -66,9 +66,8 @@ class Discovery(SearchResult):
     def latent_torque(self, progress: Callable[[str], None] | None = None) -> LatentTorqueComparison:
         """Torques that the baseline and the final model lack, on a fitted and a validation recording."""
         groups = (self.train, self.validation) if self.validation != self.train else (self.train,)
-        if any(
-            e.line for e in self.final.model.mechanism.effects
-        ):  # the model has the phase that a disturbance has in the first recording
+        # A periodic disturbance has the phase of the first recording in this model.
+        if any(e.line for e in self.final.model.mechanism.effects):
             groups = (self.train[:1],)
         longest = [max(group, key=lambda r: r.N) for group in groups]
         return compare_latent_torques(self.baseline, self.final if self.rounds else None, longest, progress)
@@ -157,12 +156,19 @@ class Discovery(SearchResult):
             progress: Called with a line of text at each fit of a set.
 
         Raises:
-            InputError: As `rotflex_jax.prediction_bands`.
+            InputError: As `rotflex_jax.prediction_bands`; or without a final fit, if friction differs between
+                the training runs.
         """
         recording = single(recording, "recording", shortest=SHORTEST_TO_FIT)
         say, level, others = checks.progress(progress), checked_level(level), known_recordings(known)
         if self.final_fit:
             return bands_of_final_fit(self, recording, level, others)
+        if differs := ", ".join(self.final.friction_of_runs):
+            raise InputError(
+                f"The training runs differ in {differs}, but the probable sets are fitted with one friction "
+                "for all runs; fit result.model_of(recording) to recordings of one run, and give this fit to "
+                "rf.prediction_bands."
+            )
         return bands_of_sets(self, self._probable_fits(say), recording, level, others)
 
     def _probable_fits(self, say: Callable[[str], None]) -> list[tuple[Fit, float]]:

@@ -4,7 +4,7 @@ No choice of effects depends on this module.
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -134,7 +134,7 @@ def errors_as_trained(
         locations: Effects of the model.
     """
     s = validation.problem.supermodel
-    means = [_with_own_values(s, h, h.local_z.mean(axis=0, keepdims=True)) for h in trained]
+    means = [_with_own_values(s, h, h.mean_local_z(s)[None]) for h in trained]
     each = _for_each(means, len(validation.problem.dataset.recordings))
     return free_runs(validation, [validation.model_of(h, locations, 0) for h in each]).errors
 
@@ -183,7 +183,7 @@ def errors_on_test(
     machine = [p for p in locations if runs.compared or p not in s.calibrations]
     for h, r in zip(_for_each(trained, len(recordings)), recordings, strict=True):
         k = runs.index(r)
-        local, on = (h.local_z.mean(axis=0), machine) if k is None else (own[k], [*locations, *of_runs])
+        local, on = (h.mean_local_z(s), machine) if k is None else (own[k], [*locations, *of_runs])
         models.append(test.model_of(_with_own_values(s, h, local[None]), on, 0))
     return free_runs(test, models).errors
 
@@ -321,17 +321,20 @@ class PairedEstimates(NamedTuple):
     where: str
 
 
-def disagreement(pairs: Sequence[PairedEstimates], location: EffectLocation) -> str:
+def disagreement(
+    pairs: Sequence[PairedEstimates], location: EffectLocation, own: Collection[str] = ()
+) -> str:
     """A clause that the size of an effect differs between recordings, or is not determined; otherwise empty.
 
     Args:
         pairs: Pairs of fits to compare.
         location: The effect; for an effect with a value for each recording, the clause is empty.
+        own: Names of sizes that each recording has for itself; they are left out.
     """
     head, kind = location.name_prefix, CATALOG[location.effect]
-    if kind.per_recording or not kind.amplitudes:
+    names = {location.full_name(n) for n in kind.amplitudes}.difference(own)
+    if kind.per_recording or not names:
         return ""
-    names = {location.full_name(n) for n in kind.amplitudes}
     for training, other, where in pairs:
         for a, b in differing(training, other):
             if a.name in names:
@@ -344,14 +347,17 @@ def disagreement(pairs: Sequence[PairedEstimates], location: EffectLocation) -> 
     return ""
 
 
-def difference_notes(s: SuperModel, pairs: Sequence[PairedEstimates]) -> tuple[str, ...]:
+def difference_notes(
+    s: SuperModel, pairs: Sequence[PairedEstimates], sizes: Collection[int] = ()
+) -> tuple[str, ...]:
     """Sentences on parameters of the machine that differ between recordings by more than their intervals.
 
     Args:
         s: The super-model, whose calibrations and effects with a value for each recording are left out.
         pairs: Pairs of fits to compare.
+        sizes: Indices of sizes of friction that each recording has for itself; they are left out too.
     """
-    own = {s.mechanism.parameter_names[i] for i in s.local}
+    own = {s.mechanism.parameter_names[i] for i in (*s.local, *sizes)}
     for effect in s.mechanism.effects:
         if effect.per_recording:
             own |= {n for n in s.mechanism.parameter_names if n.startswith(effect.name_prefix)}

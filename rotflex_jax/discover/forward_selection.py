@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from rotflex_jax.discover.checkpoint import AddedEffect, beginning
+from rotflex_jax.discover.friction_of_runs import Refits, refit_with_own_friction
 from rotflex_jax.discover.hypothesis import CandidateStart, generalisations, parameter_count
 from rotflex_jax.discover.pairs import best_candidates, find_pair, is_unexplained
 from rotflex_jax.discover.score_test import Score, promising_at_both
@@ -17,12 +18,7 @@ from rotflex_jax.discover.selection import (
     replaced_by,
     validate_from_best_states,
 )
-from rotflex_jax.discover.stepwise import (
-    Refits,
-    refit_candidates,
-    refit_near_predictions,
-    refit_with_own_friction,
-)
+from rotflex_jax.discover.stepwise import refit_candidates, refit_near_predictions
 from rotflex_jax.discover.supermodel import EffectLocation
 from rotflex_jax.discover.validation import ValidatedHypothesis
 from rotflex_jax.effects import CATALOG
@@ -126,7 +122,7 @@ def _dry_friction(state: SearchState, promising: Sequence[Promising]) -> list[Pr
         tests = state.score_tests(beside)
         order = best_candidates(*tests, len(s.candidates))
         laws = [p for p in order if law_of(p.effect) == DRY_FRICTION and p.port in driven]
-        # A law without states converges from far away, where others do not.
+        # The simplest law converges from starts far away, where richer ones often do not.
         simplest = [p for p in laws if p.port == laws[0].port and not CATALOG[p.effect].contains]
         laws = list(dict.fromkeys([*laws[:FRICTION_LAWS], *simplest]))
         if laws:

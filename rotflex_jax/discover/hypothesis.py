@@ -145,6 +145,15 @@ class Hypothesis:
         mean[phased] = values[0, phased]
         return mean
 
+    def mean_local_z(self, s: SuperModel) -> Float[np.ndarray, " L"]:
+        """Local parameters for a run of which nothing is known; sizes have the mean of physical values."""
+        mean = self.local_z.mean(axis=0)
+        if self.sizes:
+            specs = [s.mechanism.parameter_specifications[i] for i in self.sizes]
+            sizes = self.values(s)[:, list(self.sizes)].mean(axis=0)
+            mean[[self.local.index(i) for i in self.sizes]] = Transform.of(specs).unconstrain(sizes)
+        return mean
+
     def physical(self, s: SuperModel) -> tuple[Float[np.ndarray, "R P"], Float[np.ndarray, "R P"]]:
         """Physical values and their derivative by the unconstrained ones."""
         z = np.tile(self.z, (len(self.x0), 1))
@@ -248,7 +257,8 @@ def replacing(
             # Parameters of the simpler effect keep their size; only other parameters get the share.
             own[k] = known[name[i]] / (share if c.scaled[k] else 1.0)
     richer = with_effect(s, h, dataclasses.replace(start, values=own), share)
-    return with_sizes_of_runs(s, richer, {i: of_runs[name[i]] for i in c.parameters if name[i] in of_runs})
+    own = {i: of_runs[name[i]] for i in c.parameters if name[i] in of_runs}
+    return with_own_friction(s, with_sizes_of_runs(s, richer, own), start.location) if own else richer
 
 
 def with_effect(s: SuperModel, h: Hypothesis, start: CandidateStart, share: float) -> Hypothesis:
@@ -364,7 +374,10 @@ def handed_over(s: SuperModel, h: Hypothesis, location: EffectLocation) -> Hypot
         transform = Transform.of([s.mechanism.parameter_specifications[i]])
         total = (values[:, i] + values[:, given])[:, None]
         z[i] = transform.unconstrain(total.mean(axis=0))[0]
-        if i in less.local:
+        if i not in less.local and given in h.sizes:
+            less = with_sizes_of_runs(s, less, {i: total[:, 0]})
+            local_z = less.local_z
+        elif i in less.local:
             local_z[:, less.local.index(i)] = transform.unconstrain(total)[:, 0]
     return dataclasses.replace(less, z=z, local_z=local_z)
 

@@ -15,6 +15,7 @@ from rotflex_jax.discover.checkpoint import (
     read_stages,
     restored,
 )
+from rotflex_jax.discover.friction_of_runs import baseline_with_own_friction
 from rotflex_jax.discover.hypothesis import Hypothesis, is_physical, law_with_its_size
 from rotflex_jax.discover.likelihood import LikelihoodProblem
 from rotflex_jax.discover.pairs import promising_pairs
@@ -31,7 +32,6 @@ from rotflex_jax.discover.score_test import PairScore, Score, ScoreTest, residua
 from rotflex_jax.discover.selection import best_window_rmse, runs_clearly_better
 from rotflex_jax.discover.stepwise import (
     as_given,
-    baseline_with_own_friction,
     far_from_given,
     fit_baseline,
     fit_free_run_baseline,

@@ -32,7 +32,6 @@ from rotflex_jax.discover.likelihood import (
 from rotflex_jax.discover.selection import (
     FREE_RUN_BETTER,
     FREE_RUN_Z,
-    SUPPORT_Z,
     TRAIN_Z,
     WINDOWS_BETTER,
     distinguished,
@@ -51,7 +50,6 @@ from rotflex_jax.discover.validation import (
     validate,
 )
 from rotflex_jax.effects import CATALOG
-from rotflex_jax.effects.base import DRY_FRICTION
 from rotflex_jax.mechanism import Mechanism
 from rotflex_jax.mechanism.assembly import Layout
 from rotflex_jax.runtime.persistent_jit import make_ahead
@@ -157,10 +155,10 @@ def refit_candidates(
         make_ahead(problem.slopes, [with_candidate(s, current, c, START_SHARES[0])])
     # Each candidate has one thread from start to end, so none waits for the slowest one after every stage.
     refitted = on_threads(lambda c: _refit_candidate(problem, current, c), starts)
-    return _refit_from_contained(problem, refitted, starts)
+    return refit_from_contained(problem, refitted, starts)
 
 
-def _refit_from_contained(
+def refit_from_contained(
     problem: LikelihoodProblem, refitted: list[Hypothesis], starts: Sequence[CandidateStart]
 ) -> list[Hypothesis]:
     """Refits repeated from the fits of the candidates that their effects contain; the likelier is kept.
@@ -172,7 +170,8 @@ def _refit_from_contained(
         (i, replacing(problem.supermodel, refitted[j], [b.location], a, START_SHARES[-1]))
         for i, a in enumerate(starts)
         for j, b in enumerate(starts)
-        if a.location.contains(b.location)
+        if a is not b
+        and a.location.contains(b.location)
         and (problem.free_run or refitted[i].log_likelihood < refitted[j].log_likelihood)
     ]
     return refit_from(problem, refitted, again)
@@ -228,73 +227,6 @@ def refit_near_predictions(
     """
     begun = enumerate(on_threads(lambda h: as_free_run(problem, h), predictions))
     return refit_from(problem, refitted, [(i, h) for i, h in begun if np.isfinite(h.log_likelihood)])
-
-
-class Refits(NamedTuple):
-    """Models with one candidate each, in the same order at both horizons.
-
-    Attributes:
-        predictions: The models fitted to predictions.
-        free_runs: The models fitted to free runs.
-    """
-
-    predictions: list[Hypothesis]
-    free_runs: list[Hypothesis]
-
-
-def refit_with_own_friction(horizons: Horizons, refits: Refits, starts: Sequence[CandidateStart]) -> Refits:
-    """Refits of friction repeated with a size for each recording, where all runs are clearly better so.
-
-    Friction changes with temperature, wear and load, so it may differ between runs. One size for all of them
-    may then fit no run, and the friction would be refused. A single run cannot show such a difference.
-
-    Args:
-        horizons: Training recordings at both horizons.
-        refits: Models with one candidate each.
-        starts: The candidate of each model, with its start of a refit to free runs.
-    """
-    prediction, free_run = horizons.prediction.problem, horizons.free_run.problem
-    if not free_run.several_runs:
-        return refits
-    s, kept = free_run.supermodel, Refits(list(refits.predictions), list(refits.free_runs))
-    own = [with_own_friction(s, h, c.location) for h, c in zip(refits.free_runs, starts, strict=True)]
-    asked = [k for k, h in enumerate(own) if h.sizes != refits.free_runs[k].sizes]
-    fitted = refit(free_run, [own[k] for k in asked])
-    fitted = _refit_from_contained(free_run, fitted, [starts[k] for k in asked])
-    taken = {
-        k: h for k, h in zip(asked, fitted, strict=True) if _better_in_each(free_run, h, refits.free_runs[k])
-    }
-    again = [with_own_friction(s, refits.predictions[k], starts[k].location) for k in taken]
-    for (k, h), prediction_fit in zip(taken.items(), refit(prediction, again), strict=True):
-        kept.predictions[k], kept.free_runs[k] = prediction_fit, h
-    return kept
-
-
-def baseline_with_own_friction(
-    horizons: Horizons, prediction: Hypothesis, free_run: Hypothesis
-) -> tuple[Hypothesis, Hypothesis]:
-    """The user's model with friction of its own size in each recording (`refit_with_own_friction`).
-
-    Args:
-        horizons: Training recordings at both horizons.
-        prediction: The user's model fitted to predictions.
-        free_run: The user's model fitted to free runs.
-    """
-    laws = [e for e in horizons.prediction.problem.supermodel.baseline.effects if e.law_of == DRY_FRICTION]
-    refits = Refits([prediction], [free_run])
-    for effect in laws:
-        start = CandidateStart(EffectLocation(effect.name, effect.at), np.zeros(0))
-        refits = refit_with_own_friction(horizons, refits, [start])
-    return refits.predictions[0], refits.free_runs[0]
-
-
-def _better_in_each(problem: LikelihoodProblem, h: Hypothesis, other: Hypothesis) -> bool:
-    """Whether free runs are clearly better with a hypothesis than with another one, in each recording too."""
-    gain, z = paired_gain(h.blocks, other.blocks)
-    ends = np.cumsum(problem.block_counts)[:-1]
-    each = zip(*(np.split(x.blocks, ends) for x in (h, other)), strict=True)
-    better = gain / len(h.blocks) > FREE_RUN_BETTER and z > FREE_RUN_Z
-    return better and all(paired_gain(*blocks)[1] > SUPPORT_Z for blocks in each)
 
 
 class Eliminated(NamedTuple):
@@ -442,7 +374,9 @@ def remaining_rivals(
     swapped = []
     for p, r in pairs:
         less, shapes = without(s, final.hypothesis, p), usual_start(s, r).shapes
-        swapped.append(problem.likeliest([with_effect(s, less, c, x) for c in shapes for x in START_SHARES]))
+        start = problem.likeliest([with_effect(s, less, c, x) for c in shapes for x in START_SHARES])
+        has_own = set(s.parameter_indices(p)).intersection(final.hypothesis.sizes)
+        swapped.append(with_own_friction(s, start, r) if has_own else start)
     validated = on_threads(lambda h: validate(validation, h), refit(problem, swapped))
     alike = {pair for pair, t in zip(pairs, validated, strict=True) if not distinguished(final, t)}
     left = {p: [r for r in remaining[p] if (p, r) in alike or CATALOG[r.effect].line] for p in found}
@@ -675,17 +609,6 @@ def calibration_notes(
                 )
             )
     return tuple(out)
-
-
-def own_friction_notes(s: SuperModel, h: Hypothesis) -> tuple[str, ...]:
-    """Sentences on sizes of friction that differ between the training runs, with their values."""
-    names, specs, values = s.mechanism.parameter_names, s.mechanism.parameter_specifications, h.values(s)
-    return tuple(
-        f"{names[i]} differs between the training recordings: "
-        + ", ".join(f"{v:.3g} {specs[i].unit}" for v in values[:, i])
-        + "; other parts of these runs get the value of their run, other runs the mean."
-        for i in h.sizes
-    )
 
 
 def disturbance_notes(s: SuperModel, final: ValidatedHypothesis) -> tuple[str, ...]:

@@ -19,6 +19,7 @@ from rotflex_jax.discover.evaluation import (
     process_noise_gain,
 )
 from rotflex_jax.discover.final_fit import Refused, fit_to_all
+from rotflex_jax.discover.friction_of_runs import own_friction_notes
 from rotflex_jax.discover.hypothesis import Hypothesis
 from rotflex_jax.discover.likelihood import choose_process_noise, finer_integration
 from rotflex_jax.discover.localise import locate
@@ -43,7 +44,6 @@ from rotflex_jax.discover.stepwise import (
     disturbance_notes,
     far_from_given,
     nested_models,
-    own_friction_notes,
     refit_without,
     titled,
 )
@@ -106,7 +106,8 @@ def evaluate_models(state: SearchState, evaluation: Evaluation) -> EvaluatedMode
     train, held_back = problem.dataset.recordings, validation.problem.dataset.recordings
     longest, channels = longest_recording(train, held_back), model.mechanism.channels
     seconds, noise = validation.window_seconds, problem.noise
-    as_it_is = built.model_of(models[0], (), 0)
+    of_run = KnownRuns.of(train, held_back).index(longest) or 0
+    as_it_is = built.model_of(models[0], (), of_run)
     residual = model.measured(longest) - as_it_is.simulate_windows(longest, seconds)
     pairs = paired_estimates(reported, validated[-1], stages[-1].estimates)
     m = stages[-1].model.mechanism
@@ -162,7 +163,7 @@ def conclude(state: SearchState, evaluated: EvaluatedModels, started: float) -> 
             *_run_notes(state, evaluated.test),
             *own_friction_notes(supermodel, evaluated.final.hypothesis),
             *disturbance_notes(supermodel, evaluated.final),
-            *difference_notes(supermodel, evaluated.pairs),
+            *difference_notes(supermodel, evaluated.pairs, evaluated.final.hypothesis.sizes),
             *_far_baseline(state),
             *state.notes,
             *([last.sentence] if isinstance(last, Refused) else []),
@@ -363,5 +364,6 @@ def _doubts(
         reasons.append("predictions on validation data are no better with it")
     if runs is not None and not helps(runs):
         reasons.append("free runs over validation data are no better with it")
-    differs = disagreement(pairs, location)
+    names, current = state.problem.supermodel.mechanism.parameter_names, state.current.hypothesis
+    differs = disagreement(pairs, location, [names[i] for i in current.sizes])
     return (*reasons, differs) if differs else tuple(reasons)

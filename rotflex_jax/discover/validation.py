@@ -278,7 +278,10 @@ def _cross_validated(
         fitted = refit(fold.train, [start], alternations=1)[0]
         # This fit does not know the calibrations of the recording that is left out: it gets their mean.
         k, own = len(fits), fitted.local_z.copy()
-        own[k] = np.delete(own, k, axis=0).mean(axis=0)
+        rest = dataclasses.replace(
+            fitted, local_z=np.delete(own, k, axis=0), x0=np.delete(fitted.x0, k, axis=0)
+        )
+        own[k] = rest.mean_local_z(fold.train.supermodel)
         fits.append(dataclasses.replace(fitted, local_z=own))
         found.append(validate(fold.validation, fits[-1], near, inner))
     own = np.array([v.adapted.local_z[k] for k, v in enumerate(found)])
@@ -309,9 +312,9 @@ def carried_over(problem: LikelihoodProblem, h: Hypothesis) -> Hypothesis:
     Friction that differs between runs has the size of the run, or the mean for a run that was not trained.
     """
     first = problem.windows.first_states
-    local_z = np.tile(h.local_z.mean(axis=0), (len(first), 1))
+    local_z = np.tile(h.mean_local_z(problem.supermodel), (len(first), 1))
     sizes = [h.local.index(i) for i in h.sizes]
-    for own, k in zip(local_z, problem.trained, strict=False):
+    for own, k in zip(local_z, problem.trained or (None,) * len(first), strict=True):
         if k is not None:
             own[sizes] = h.local_z[k, sizes]
     start = dataclasses.replace(

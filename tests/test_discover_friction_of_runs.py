@@ -14,6 +14,7 @@ import rotflex_jax as rf
 import rotflex_jax.effects as fx
 from rotflex_jax.arena.simulator.records import make_record
 from rotflex_jax.discover.checkpoint import kept, restored
+from rotflex_jax.discover.friction_of_runs import Refits, refit_with_own_friction
 from rotflex_jax.discover.hypothesis import (
     CandidateStart,
     Hypothesis,
@@ -25,7 +26,7 @@ from rotflex_jax.discover.hypothesis import (
     without,
 )
 from rotflex_jax.discover.likelihood import LikelihoodProblem, refit
-from rotflex_jax.discover.stepwise import Refits, fit_baseline, refit_candidates, refit_with_own_friction
+from rotflex_jax.discover.stepwise import fit_baseline, refit_candidates
 from rotflex_jax.discover.supermodel import EffectLocation
 from rotflex_jax.discover.validation import Horizons, adapted_to_recordings, as_free_run, carried_over
 from rotflex_jax.models.model import Model
@@ -101,7 +102,7 @@ def test_another_part_of_a_run_has_the_friction_of_the_run(differ: Fitted):
     own = levels_of(problem, h)
     column = h.local.index(problem.supermodel.mechanism.parameter_names.index(LEVEL))
     np.testing.assert_allclose(levels_of(problem, other)[0], own[1], rtol=1e-12)
-    np.testing.assert_allclose(other.local_z[1, column], h.local_z[:, column].mean(), rtol=1e-12)
+    np.testing.assert_allclose(levels_of(problem, other)[1], own.mean(), rtol=1e-9)
     start = dataclasses.replace(other, local_z=other.local_z + 0.1 * (np.arange(len(h.local)) != column))
     adapted = adapted_to_recordings(problem, start)
     np.testing.assert_array_equal(levels_of(problem, adapted), levels_of(problem, other))
@@ -144,6 +145,15 @@ def test_friction_that_is_handed_over_adds_to_the_size_of_each_run(supermodel):
     np.testing.assert_allclose(own, [0.02, 0.04], rtol=1e-9)
 
 
+def test_a_law_without_sizes_of_runs_takes_them_over_from_the_friction_that_is_left_out(supermodel):
+    s = supermodel
+    h = handed_over(s, with_levels(s, COULOMB, STRIBECK), COULOMB)
+    assert h is not None
+    own = h.values(s)[:, s.mechanism.parameter_names.index("hub.stribeck.level")]
+    np.testing.assert_allclose(own, [0.02, 0.04], rtol=1e-9)
+    assert COULOMB not in h.locations
+
+
 def test_a_stopped_search_keeps_the_sizes_of_runs(differ: Fitted):
     (h,) = differ.own.predictions
     again = restored(differ.problem, kept(h))
@@ -164,6 +174,8 @@ def test_a_search_on_runs_with_different_friction():
     assert any(n.startswith(f"{LEVEL} differs between the training recordings: ") for n in found.notes)
     run = found.model_of(validation[1]).mechanism.named_values[LEVEL]
     assert run == found.to_dict()["friction_of_runs"][LEVEL][1] == pytest.approx(LEVELS[1], rel=0.1)
+    with pytest.raises(rf.InputError, match=f"The training runs differ in {LEVEL}"):
+        found.prediction_bands(validation[0])
     errors = np.array(list(found.final.held_out_rmse_windows.values()))
     assert np.all(errors < 1.3 * sp.NOISE)
 
