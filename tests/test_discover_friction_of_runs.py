@@ -137,17 +137,11 @@ def test_a_richer_law_takes_over_the_size_of_each_run(supermodel):
     assert not bare.sizes and not bare.local and bare.local_z.shape == (2, 0)
 
 
-def test_friction_that_is_handed_over_adds_to_the_size_of_each_run(supermodel):
+@pytest.mark.parametrize("laws", [(STRIBECK, COULOMB), (COULOMB, STRIBECK)], ids=lambda p: p[0].effect)
+def test_friction_that_is_handed_over_adds_to_the_size_of_each_run(supermodel, laws):
+    """The sizes of runs belong to the law that takes over the other one, or to the one that is left out."""
     s = supermodel
-    h = handed_over(s, with_levels(s, STRIBECK, COULOMB), COULOMB)
-    assert h is not None
-    own = h.values(s)[:, s.mechanism.parameter_names.index("hub.stribeck.level")]
-    np.testing.assert_allclose(own, [0.02, 0.04], rtol=1e-9)
-
-
-def test_a_law_without_sizes_of_runs_takes_them_over_from_the_friction_that_is_left_out(supermodel):
-    s = supermodel
-    h = handed_over(s, with_levels(s, COULOMB, STRIBECK), COULOMB)
+    h = handed_over(s, with_levels(s, *laws), COULOMB)
     assert h is not None
     own = h.values(s)[:, s.mechanism.parameter_names.index("hub.stribeck.level")]
     np.testing.assert_allclose(own, [0.02, 0.04], rtol=1e-9)

@@ -125,9 +125,7 @@ class LikelihoodProblem:
     @property
     def block_counts(self) -> list[int]:
         """Number of blocks of each recording."""
-        data = self.dataset.data
-        counts = (int(n) for n in data.seen.sum(axis=1))
-        return [len(block_edges(n, float(Ts))) if n else 0 for n, Ts in zip(counts, data.Ts, strict=True)]
+        return [len(sums) for sums in _in_blocks_of_each(self.seen, self.dataset.data)]
 
     @property
     def direction_count(self) -> int:
@@ -303,11 +301,18 @@ def block_edges(N: int, Ts: float) -> Int[np.ndarray, " B"]:
 
 def in_blocks(values: Float[np.ndarray, "R N"], data: StackedRecordings) -> Float[np.ndarray, " B"]:
     """Sums over the blocks of each recording, for all recordings in one array."""
+    return np.concatenate(_in_blocks_of_each(values, data))
+
+
+def _in_blocks_of_each(
+    values: Float[np.ndarray, "R N"], data: StackedRecordings
+) -> list[Float[np.ndarray, " B"]]:
+    """Sums over the blocks of each recording."""
     out = []
     for row, seen, Ts in zip(values, data.seen, data.Ts, strict=True):
         N = int(seen.sum())
         out.append(np.add.reduceat(row[:N], block_edges(N, float(Ts))) if N else np.zeros(0))
-    return np.concatenate(out)
+    return out
 
 
 # Levenberg-Marquardt stops at this decrease of the negative log-likelihood [nat]. A relative tolerance would
