@@ -896,7 +896,7 @@ def test_a_rival_of_a_round_must_hold_beside_the_other_effects(monkeypatch, foun
         EffectLocation("dahl", "arm"): trial(None, 1000.0, 1000.0, 1.09 * 1.5),
     }
     candidates = dict.fromkeys(in_place, SimpleNamespace(probes=(((1.0,),),)))
-    supermodel = SimpleNamespace(candidates=candidates)
+    supermodel = SimpleNamespace(candidates=candidates, parameter_indices=lambda location: ())
     problem: Any = SimpleNamespace(supermodel=supermodel, likeliest=lambda starts: starts[0])
     monkeypatch.setattr(stepwise, "without", lambda s, h, location: h)
     monkeypatch.setattr(stepwise, "with_effect", lambda s, h, start, share: start.location)

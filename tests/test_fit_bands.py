@@ -145,7 +145,7 @@ def test_bands_of_a_search_are_those_of_its_probable_sets():
     train, rec = recording(1), recording(9)
     shares = {frozenset(): 0.7, frozenset({"viscous@hub"}): 0.2, frozenset({"coulomb@hub"}): 0.01}
     found = Probabilities(tuple(SetProbability(s, p) for s, p in shares.items()), {}, 0.09)
-    baseline, said = SimpleNamespace(model=rf.Model(axis())), []
+    baseline, said = SimpleNamespace(model=rf.Model(axis()), friction_of_runs=()), []
     search = Discovery(
         Verdict.FOUND, "", (train,), (recording(2),), baseline, (), (), (), {}, 0.0, probabilities=found
     )
