@@ -73,7 +73,8 @@ class Transform:
     """Transform between unconstrained `z` and physical `p`, elementwise, by the bounds of each parameter.
 
     With a lower bound `p = lower + exp(z)`, with an upper bound `p = upper - exp(z)`, with both a logistic
-    curve, without bounds `p = typical z`. A step of one in `z` is always a substantial step in `p`.
+    curve, without bounds `p = typical z`. A step of one in `z` is a substantial step in `p`, unless a value
+    without bounds is many times its typical size.
     """
 
     lower: Float[np.ndarray, " P"]
@@ -85,6 +86,11 @@ class Transform:
         """The transform for a list of declared parameters."""
         columns = ("lower", "upper", "typical")
         return cls(*(np.array([getattr(s, c) for s in specs], dtype=float) for c in columns))
+
+    @property
+    def bounded(self) -> Bool[np.ndarray, " P"]:
+        """Which parameters have a bound; for those, a step of one in `z` is substantial at any value."""
+        return np.isfinite(self.lower) | np.isfinite(self.upper)
 
     def _kinds(
         self,

@@ -249,11 +249,27 @@ def test_one_step_is_no_longer_than_allowed(rough):
     far = sp.start(rough, wrong=5.0)
     found = levenberg_marquardt(rough, [far], max_steps=1)[0]
     free = list(far.free)
-    longest = np.abs(found.z[free] - far.z[free]).max()
-    assert longest == pytest.approx(LARGEST_STEP)
+    specs = [rough.supermodel.mechanism.parameter_specifications[i] for i in free]
+    bounded = np.array([bool(np.isfinite(x.lower) or np.isfinite(x.upper)) for x in specs])
+    # A parameter without a bound may move by its size, if this is more than its typical size.
+    most = LARGEST_STEP * np.where(bounded, 1.0, np.maximum(np.abs(far.z[free]), 1.0))
+    assert np.max(np.abs(found.z[free] - far.z[free]) / most) == pytest.approx(1.0)
     assert np.abs(found.local_z - far.local_z).max() <= LARGEST_STEP * (1 + 1e-9)
     held = [i for i in range(len(far.z)) if i not in far.free]
     np.testing.assert_array_equal(found.z[held], far.z[held])
+
+
+@pytest.mark.parametrize("times", [0.0, 300.0])
+def test_damping_without_a_bound_is_found_from_any_value(plain, times):
+    """A viscous coefficient has a typical size of 0.01; fits begin at zero and at 300 times this size."""
+    problem, usual = plain
+    i = problem.supermodel.mechanism.parameter_names.index("joint.viscous.coefficient")
+    assert i in usual.free
+    z = usual.z.copy()
+    z[i] = times
+    (again,) = refit(problem, [dataclasses.replace(usual, z=z)])
+    assert again.log_likelihood == pytest.approx(usual.log_likelihood, abs=1.0)
+    assert again.z[i] == pytest.approx(usual.z[i], rel=0.02)
 
 
 def test_grid_of_intensities():

@@ -22,7 +22,7 @@ from rotflex_jax.fit.dataset import Dataset, StackedRecordings, Windows, torque_
 from rotflex_jax.mechanism import Solver, kalman_gains
 from rotflex_jax.mechanism.assembly import Layout
 from rotflex_jax.mechanism.finer_step import with_finer_steps
-from rotflex_jax.optimise.damped_least_squares import LARGEST_STEP, NormalEquations, Rules, minimise
+from rotflex_jax.optimise.damped_least_squares import NormalEquations, Rules, minimise, step_limits
 from rotflex_jax.recording.recording import of_one_run
 from rotflex_jax.runtime.persistent_jit import make_ahead
 from rotflex_jax.runtime.xla import on_threads
@@ -137,6 +137,11 @@ class LikelihoodProblem:
     def directions_of(self, h: Hypothesis) -> int:
         """Number of directions of slopes that is used for a hypothesis."""
         return max(self.direction_count, _multiple_of_four(h.moved))
+
+    def step_limits(self, h: Hypothesis) -> Float[np.ndarray, " P"]:
+        """Largest step of each common parameter of a hypothesis, followed by each local one."""
+        z = np.concatenate([h.z[list(h.free)], np.abs(h.local_z).max(axis=0)])
+        return step_limits(self.supermodel.transform.bounded[[*h.free, *h.local]], z)
 
     @property
     def process_noise_range(self) -> tuple[float, float]:
@@ -362,7 +367,7 @@ def _fitted(problem: LikelihoodProblem, h: Hypothesis, max_steps: int = MAX_STEP
         linearise,
         _Point(h),
         REFIT_RULES,
-        limit=coordinates.step_limit(LARGEST_STEP),
+        limit=coordinates.step_limit(problem.step_limits(h)),
         move=lambda p, step: _Point(coordinates.moved(p.hypothesis, step)),
         max_steps=max_steps,
     )
@@ -505,7 +510,7 @@ def correct_discretisation_bias(problem: LikelihoodProblem, h: Hypothesis) -> Hy
         linearise,
         h,
         CORRECTION_RULES,
-        limit=coordinates.step_limit(LARGEST_STEP),
+        limit=coordinates.step_limit(problem.step_limits(h)),
         move=coordinates.moved,
         max_steps=MAX_CORRECTION_STEPS,
     )

@@ -13,7 +13,7 @@ from rotflex_jax.discover.hypothesis import Hypothesis
 from rotflex_jax.discover.likelihood import LikelihoodProblem, choose_process_noise
 from rotflex_jax.effects.learned import LearnedTorque
 from rotflex_jax.fit.coordinates import FitCoordinates
-from rotflex_jax.optimise.damped_least_squares import LARGEST_STEP, NormalEquations, Rules, after_trial, begin
+from rotflex_jax.optimise.damped_least_squares import NormalEquations, Rules, after_trial, begin
 
 # Steps with one process noise end when a step lowers the penalised cost by less than this [nat].
 MIN_STEP_NATS = 0.3
@@ -229,7 +229,8 @@ def _step(
     penalised = NormalEquations(np.array([before]), free.T @ g, free.T @ H @ free)
     # Outputs are linear in the weights but not in the physics.
     limit = np.full(free.shape[1], np.inf)
-    limit[np.searchsorted(rest, equations.physics)] = LARGEST_STEP
+    physics = equations.physics
+    limit[np.searchsorted(rest, physics)] = problem.step_limits(h)[physics]
     progress = begin(before, MAP_RULES._replace(damping=damping))
     for _ in range(TRIALS_PER_STEP):
         step, _ = penalised.step(float(progress.damping), limit)

@@ -23,7 +23,7 @@ from rotflex_jax.fit.linear import factor
 from rotflex_jax.mechanism import Mechanism, Solver, free_run, kalman_gains, predictor_run
 from rotflex_jax.mechanism.assembly import Layout, rest_state
 from rotflex_jax.models.model import Model
-from rotflex_jax.optimise.damped_least_squares import LARGEST_STEP, NormalEquations, Rules, Status, minimise
+from rotflex_jax.optimise.damped_least_squares import NormalEquations, Rules, Status, minimise, step_limits
 from rotflex_jax.parameters import Transform
 from rotflex_jax.runtime.persistent_jit import persistent_jit
 from rotflex_jax.runtime.xla import double_precision
@@ -299,7 +299,9 @@ def fit_rival(
             return _Linearisation(np.asarray(w), np.asarray(J))
 
         first = rival.start if start is None else start
-        limit = np.full(len(first), LARGEST_STEP)
+        m = len(rival.free)
+        parameters = step_limits(rival.transform.bounded[list(rival.free)], first[:m])
+        limit = np.concatenate([parameters, np.full(len(first) - m, np.inf)])
         found = minimise(linearised, first, RULES, limit=limit, max_steps=MAX_STEPS - 1)
     steps = found.evaluations + 1
     if found.status == Status.DIVERGED:

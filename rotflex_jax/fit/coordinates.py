@@ -133,13 +133,12 @@ class FitCoordinates:
                 x0[r, k, : self.states] += step[self.state_columns(r, k)]
         return dataclasses.replace(h, z=z, local_z=local_z, x0=x0)
 
-    def step_limit(self, largest: float | Float[np.ndarray, " P"]) -> Float[np.ndarray, " M"]:
+    def step_limit(self, each: Float[np.ndarray, " P"]) -> Float[np.ndarray, " M"]:
         """Largest step of each coordinate; it is infinite for first states.
 
         Args:
-            largest: Largest step of all parameters; or of each common parameter, followed by each local one.
+            each: Largest step of each common parameter, followed by each local one.
         """
-        each = np.broadcast_to(largest, self.shared + self.local)
         most = np.full(self.size, np.inf)
         most[: self.shared] = each[: self.shared]
         for r in range(len(self.windows.counts)):

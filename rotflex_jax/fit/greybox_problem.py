@@ -543,9 +543,7 @@ class GreyBoxProblem:
 
     def _limit(self, point: FitPoint, windows: Windows) -> Float[np.ndarray, " M"]:
         """Largest step of each coordinate; a parameter with one bound may change by a factor of e."""
-        specs = self.model.mechanism.parameter_specifications
-        bounded = np.array([bool(np.isfinite(s.lower) or np.isfinite(s.upper)) for s in specs])
-        most = np.where(bounded, LARGEST_STEP, np.inf)
+        most = np.where(self.transform.bounded, LARGEST_STEP, np.inf)
         return self.coordinates(point, windows).step_limit(most[[*point.free, *point.local]])
 
     def _minimum(

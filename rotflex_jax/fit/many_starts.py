@@ -29,12 +29,12 @@ from rotflex_jax.mechanism.assembly import whole_state
 from rotflex_jax.mechanism.sensitivities import RecordingSamples, RunParameters
 from rotflex_jax.models.model import Model
 from rotflex_jax.optimise.damped_least_squares import (
-    LARGEST_STEP,
     NormalEquations,
     Rules,
     bounded_solution,
     damped,
     minimise_compiled,
+    step_limits,
 )
 from rotflex_jax.parameters import Transform
 from rotflex_jax.recording import Recording
@@ -159,6 +159,7 @@ def _minimise_each(
     tolerance: float,
 ) -> StartResults:
     transform = Transform.of(structure.parameter_specifications)
+    bounded = transform.bounded
 
     def values(z: Array) -> Array:
         whole = jnp.zeros_like(inputs.values).at[inputs.free].set(z)
@@ -181,7 +182,7 @@ def _minimise_each(
             linearise,
             start,
             Rules(enough_share=tolerance),
-            limit=jnp.full_like(start[0], LARGEST_STEP),
+            limit=step_limits(jnp.asarray(bounded)[inputs.free], start[0]),
             max_steps=max_steps,
         )
         return StartResults(values(z), x0, equations.cost, progress.evaluations, z)

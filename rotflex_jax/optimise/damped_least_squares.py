@@ -28,14 +28,15 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Real, Shaped
+from jaxtyping import Bool, Float, Real, Shaped
 
 SHORT = 1e-3
 """Damping above which a step is so short that it does not show how much the cost can still decrease."""
 RIDGE = 1e-14
 """Damping that is always added, against rounding errors, as a share of the diagonal."""
 LARGEST_STEP = 1.0
-"""Largest move of an unconstrained coordinate in one step; for a logarithm, a factor of e."""
+"""Largest move of the unconstrained coordinate of a bounded parameter in one step: a factor of e for a
+logarithm."""
 LEAST_CURVATURE = 1e-12
 """Least entry of the diagonal by which the damping is scaled, as a share of the largest entry."""
 
@@ -83,6 +84,21 @@ class Rules(NamedTuple):
     increase: float = 8.0
     least: float = 1e-12
     largest: float = 1e10
+
+
+def step_limits(bounded: Bool[Any, " n"], z: Float[Any, "*batch n"]) -> Float[Any, "*batch n"]:
+    """Largest step of unconstrained parameters from a start: `LARGEST_STEP` for parameters with a bound.
+
+    The unit of other coordinates is a typical size of the parameter. From a value many times as large, steps
+    of one unit would not reach the minimum before a fit stops, so their limit is their size at the start, and
+    at least `LARGEST_STEP`.
+
+    Args:
+        bounded: Whether each parameter has a bound, see `rotflex_jax.parameters.Transform`.
+        z: The start.
+    """
+    xp = _numpy(z)
+    return LARGEST_STEP * xp.where(xp.asarray(bounded), xp.ones_like(z), xp.maximum(xp.abs(z), 1.0))
 
 
 def damped(H: Real[Any, "*batch n n"], damping: Scalar) -> Real[Any, "*damped n n"]:
