@@ -165,7 +165,7 @@ def test_a_search_on_runs_with_different_friction():
     note = next(e.note for e in found.final.estimates if e.name == LEVEL)
     assert note.startswith("mean of ")
     np.testing.assert_allclose([float(v) for v in note.removeprefix("mean of ").split(",")], LEVELS, rtol=0.1)
-    assert any(n.startswith(f"{LEVEL} differs between the training recordings: ") for n in found.notes)
+    assert any(n.startswith(f"{LEVEL} differs between runs: ") for n in found.notes)
     run = found.model_of(validation[1]).mechanism.named_values[LEVEL]
     assert run == found.to_dict()["friction_of_runs"][LEVEL][1] == pytest.approx(LEVELS[1], rel=0.1)
     with pytest.raises(rf.InputError, match=f"The training runs differ in {LEVEL}"):

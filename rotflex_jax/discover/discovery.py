@@ -163,7 +163,7 @@ class Discovery(SearchResult):
         say, level, others = checks.progress(progress), checked_level(level), known_recordings(known)
         if self.final_fit:
             return bands_of_final_fit(self, recording, level, others)
-        if differs := ", ".join(self.final.friction_of_runs):
+        if len(self.train) > 1 and (differs := ", ".join(self.final.friction_of_runs)):
             raise InputError(
                 f"The training runs differ in {differs}, but the probable sets are fitted with one friction "
                 "for all runs; fit result.model_of(recording) to recordings of one run, and give this fit to "

@@ -212,6 +212,8 @@ def evaluate(
     differ = s.phased.intersection(h.local).union(h.sizes)
     of_each = [s.clean(trained.values(s)[i], locations) for i in every] if differ else []
     values, names = h.values(s), s.mechanism.parameter_names
+    adapted = trained.values(s)
+    of_validation = {names[i]: tuple(adapted[:, i].tolist()) for i in h.sizes if not validation.folds}
     return Stage(
         model=Model(s.clean(h.mean_values(s), locations), solver),
         estimates=estimates(problem, h),
@@ -226,6 +228,7 @@ def evaluate(
         horizon="free_run" if problem.free_run else "prediction",
         of_validation=tuple(Model(m, solver) for m in of_each),
         friction_of_runs={names[i]: tuple(values[:, i].tolist()) for i in h.sizes},
+        friction_of_validation=of_validation,
     )
 
 
@@ -453,14 +456,17 @@ class Evaluation:
         """
         h, found = validated.hypothesis, dict[str, Any](calibrate_seconds=self.calibrate_seconds)
         if self.calibrate_seconds:
+            each = validated.folds or validated.of_runs(range(len(self.validation.problem.seen)))
             found["calibrated"] = errors_with_own_calibration(
-                self.validation, validated.folds or [h], locations, self.calibrate_seconds
+                self.validation, each, locations, self.calibrate_seconds
             )
         if self.test:
-            found["test"] = errors_on_test(self.test, [h], h.local_z, locations, self.runs)
+            held_back = () if validated.folds else self.validation.problem.dataset.recordings
+            each = validated.of_runs(KnownRuns(held_back, True).indices(self.recordings))
+            found["test"] = errors_on_test(self.test, each, h.local_z, locations, self.runs)
             if self.calibrate_seconds:
                 found["test_calibrated"] = errors_with_own_calibration(
-                    self.test, [h], locations, self.calibrate_seconds
+                    self.test, each, locations, self.calibrate_seconds
                 )
         return dataclasses.replace(stage, **found)
 

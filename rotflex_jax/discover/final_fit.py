@@ -36,7 +36,7 @@ from rotflex_jax.discover.evaluation import (
 from rotflex_jax.discover.final_structure import FinalStructure, FittedStructure, fit_structures
 from rotflex_jax.discover.hypothesis import Hypothesis, with_all_calibrations
 from rotflex_jax.discover.in_place import laws_in_question
-from rotflex_jax.discover.likelihood import block_edges
+from rotflex_jax.discover.likelihood import LikelihoodProblem, block_edges
 from rotflex_jax.discover.result import FinalFit, KnownRuns, RunErrors, Stage
 from rotflex_jax.discover.search_state import SearchState
 from rotflex_jax.discover.selection import (
@@ -47,7 +47,12 @@ from rotflex_jax.discover.selection import (
     paired_gain,
 )
 from rotflex_jax.discover.supermodel import EffectLocation
-from rotflex_jax.discover.validation import ValidatedHypothesis
+from rotflex_jax.discover.validation import (
+    ValidatedHypothesis,
+    adapted_to_recordings,
+    carried_over,
+    with_friction_of,
+)
 from rotflex_jax.errors import InputError
 from rotflex_jax.fit.result import Fit
 from rotflex_jax.recording import Recording
@@ -240,8 +245,12 @@ class _FinalFitBuilder:
                 own = [own[i % len(parts)] for i in range(len(train))]
                 each = [one.as_hypothesis() for one in own]
             else:
-                held_back = self.state.validation.problem.dataset.recordings
-                each = own[0].as_hypotheses(self.runs._replace(recordings=tuple(parts[0])).indices(held_back))
+                validation = self.evaluation.validation.problem
+                runs = self.runs._replace(recordings=tuple(parts[0]))
+                known = runs.indices(validation.dataset.recordings)
+                each = own[0].as_hypotheses(known)
+                if structure.hypothesis.sizes:
+                    each = _with_friction_of_other_runs(validation, each, known)
             tried.append(_Tried(own, _on_validation(structure, each, self.evaluation)))
         return tried
 
@@ -458,6 +467,25 @@ def _without_each(train: Sequence[Recording]) -> list[list[Recording]]:
     """Training recordings without each one in turn; of more than three, without each third in turn."""
     folds, each = min(len(train), MOST_FOLDS), range(len(train))
     return [[train[k] for k in each if k % folds != fold] for fold in range(folds)]
+
+
+def _with_friction_of_other_runs(
+    validation: LikelihoodProblem, each: Sequence[Hypothesis], known: Sequence[int | None]
+) -> list[Hypothesis]:
+    """Hypotheses for validation recordings, with friction fitted to those of runs that were not trained.
+
+    Args:
+        validation: Likelihood of free runs over the recordings.
+        each: One hypothesis for each recording.
+        known: For each recording, the index of a training recording of the same run; None if there is none.
+    """
+    found = list(each)
+    for k, h in enumerate(each):
+        if known[k] is None:
+            alone = validation.of_recordings([k])
+            adapted = adapted_to_recordings(alone, carried_over(alone, h), friction=True)
+            found[k] = with_friction_of(adapted, k, h)
+    return found
 
 
 def _on_validation(

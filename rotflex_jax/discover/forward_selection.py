@@ -5,7 +5,11 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from rotflex_jax.discover.checkpoint import AddedEffect, beginning
-from rotflex_jax.discover.friction_of_runs import Refits, refit_with_own_friction
+from rotflex_jax.discover.friction_of_runs import (
+    Refits,
+    refit_with_own_friction,
+    validated_with_own_friction,
+)
 from rotflex_jax.discover.hypothesis import CandidateStart, generalisations, parameter_count
 from rotflex_jax.discover.pairs import best_candidates, find_pair, is_unexplained
 from rotflex_jax.discover.score_test import Score, promising_at_both
@@ -24,6 +28,7 @@ from rotflex_jax.discover.validation import ValidatedHypothesis
 from rotflex_jax.effects import CATALOG
 from rotflex_jax.effects.base import DRY_FRICTION
 from rotflex_jax.effects.labels import law_of
+from rotflex_jax.runtime.xla import on_threads
 
 # Number of candidates that are refitted in a round, to which the best one of each horizon is added, and
 # largest number of rounds.
@@ -103,15 +108,16 @@ def add_dry_friction(state: SearchState, promising: Sequence[Promising]) -> bool
 
 
 def _dry_friction(state: SearchState, promising: Sequence[Promising]) -> list[Promising]:
-    """Laws of dry friction at the motors for the first round, if something is unexplained and none is tried.
+    """Laws of dry friction at the motors, beside each model of the first round beside which none is tried.
+
+    There are none if the model explains the recordings.
 
     Args:
         state: The search with what it has found so far.
         promising: Candidates that the round tries.
     """
-    s, tried = state.problem.supermodel, [start.location.effect for p in promising for start in p.starts]
-    known = (*tried, *(e.name for e in s.baseline.effects))
-    if state.scores or any(law_of(name) == DRY_FRICTION for name in known):
+    s = state.problem.supermodel
+    if state.scores or any(law_of(e.name) == DRY_FRICTION for e in s.baseline.effects):
         return []
     if not is_unexplained(state.horizons, state.current):
         return []
@@ -119,6 +125,9 @@ def _dry_friction(state: SearchState, promising: Sequence[Promising]) -> list[Pr
     driven = motors | {e.port for e in s.baseline.effects if e.signal}
     chosen = []
     for beside in [state.origin] if state.origin is state.current else [state.origin, state.current]:
+        tried = [start.location.effect for p in promising if p.beside is beside for start in p.starts]
+        if any(law_of(name) == DRY_FRICTION for name in tried):
+            continue
         tests = state.score_tests(beside)
         order = best_candidates(*tests, len(s.candidates))
         laws = [p for p in order if law_of(p.effect) == DRY_FRICTION and p.port in driven]
@@ -168,6 +177,7 @@ def refit_and_validate(
         dataclasses.replace(v, location=location, parameter_count=parameter_count(s, h, location))
         for v, (h, _, location) in zip(found, plausible, strict=True)
     ]
+    validated = on_threads(lambda v: validated_with_own_friction(horizons, v, beside), validated)
     validated = validate_from_best_states(state.validation, validated)
     state.tried += validated
     return validated

@@ -4,17 +4,19 @@ Friction changes with temperature, wear and load. One size for several runs may 
 would then be refused, whatever its law.
 """
 
+import dataclasses
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from rotflex_jax.discover.hypothesis import CandidateStart, Hypothesis, with_own_friction
-from rotflex_jax.discover.likelihood import LikelihoodProblem, refit
+from rotflex_jax.discover.likelihood import refit
 from rotflex_jax.discover.selection import FREE_RUN_BETTER, FREE_RUN_Z, SUPPORT_Z, paired_gain
 from rotflex_jax.discover.stepwise import refit_from_contained
-from rotflex_jax.discover.supermodel import EffectLocation, SuperModel
-from rotflex_jax.discover.validation import Horizons
+from rotflex_jax.discover.supermodel import EffectLocation
+from rotflex_jax.discover.validation import Horizons, ValidatedHypothesis, ValidationSet
 from rotflex_jax.effects.base import DRY_FRICTION
 
 
@@ -48,8 +50,11 @@ def refit_with_own_friction(horizons: Horizons, refits: Refits, starts: Sequence
     asked = [k for k, h in enumerate(own) if h.sizes != refits.free_runs[k].sizes]
     fitted = refit(free_run, [own[k] for k in asked])
     fitted = refit_from_contained(free_run, fitted, [starts[k] for k in asked])
+    counts, every = free_run.block_counts, range(len(free_run.block_counts))
     taken = {
-        k: h for k, h in zip(asked, fitted, strict=True) if _better_in_each(free_run, h, refits.free_runs[k])
+        k: h
+        for k, h in zip(asked, fitted, strict=True)
+        if _better_in_each(h.blocks, refits.free_runs[k].blocks, counts, every)
     }
     again = [with_own_friction(s, refits.predictions[k], starts[k].location) for k in taken]
     for (k, h), prediction_fit in zip(taken.items(), refit(prediction, again), strict=True):
@@ -57,39 +62,98 @@ def refit_with_own_friction(horizons: Horizons, refits: Refits, starts: Sequence
     return kept
 
 
-def baseline_with_own_friction(
-    horizons: Horizons, prediction: Hypothesis, free_run: Hypothesis
-) -> tuple[Hypothesis, Hypothesis]:
-    """The user's model with friction of its own size in each recording (`refit_with_own_friction`).
+def validated_with_own_friction(
+    horizons: Horizons, found: ValidatedHypothesis, near: ValidatedHypothesis | None = None
+) -> ValidatedHypothesis:
+    """A model whose friction also has its own size in validation runs that were not trained.
+
+    It is the given model unless free runs over each of these runs are clearly better so.
 
     Args:
-        horizons: Training recordings at both horizons.
+        horizons: Training and validation recordings at both horizons.
+        found: The model, validated; friction is that of its `location`, which may be another effect.
+        near: See `Horizons.validated`.
+    """
+    validation = horizons.free_run.validation
+    unknown = [k for k, trained in enumerate(validation.problem.trained) if trained is None]
+    assert found.free_run and found.location
+    s, fits = validation.problem.supermodel, (found.hypothesis, found.free_run.hypothesis)
+    own = [with_own_friction(s, h, found.location) for h in fits]
+    if not unknown or any(h.sizes == before.sizes for h, before in zip(own, fits, strict=True)):
+        return found
+    tried = horizons.validated(own[0], own[1], near)
+    assert tried.free_run
+    counts = validation.problem.block_counts
+    if not _better_in_each(tried.free_run.blocks, found.free_run.blocks, counts, unknown):
+        return found
+    return dataclasses.replace(tried, location=found.location, parameter_count=found.parameter_count)
+
+
+def validated_baseline(
+    horizons: Horizons, prediction: Hypothesis, free_run: Hypothesis
+) -> ValidatedHypothesis:
+    """The user's model, validated, with friction of its own size in each run where runs are better so.
+
+    Args:
+        horizons: Training and validation recordings at both horizons.
         prediction: The user's model fitted to predictions.
         free_run: The user's model fitted to free runs.
     """
-    laws = [e for e in horizons.prediction.problem.supermodel.baseline.effects if e.law_of == DRY_FRICTION]
+    effects = horizons.prediction.problem.supermodel.baseline.effects
+    laws = [EffectLocation(e.name, e.at) for e in effects if e.law_of == DRY_FRICTION]
     refits = Refits([prediction], [free_run])
-    for effect in laws:
-        start = CandidateStart(EffectLocation(effect.name, effect.at), np.zeros(0))
-        refits = refit_with_own_friction(horizons, refits, [start])
-    return refits.predictions[0], refits.free_runs[0]
+    for location in laws:
+        refits = refit_with_own_friction(horizons, refits, [CandidateStart(location, np.zeros(0))])
+    found = horizons.validated(refits.predictions[0], refits.free_runs[0])
+    for location in laws:
+        found = validated_with_own_friction(horizons, dataclasses.replace(found, location=location))
+    return dataclasses.replace(found, location=None)
 
 
-def _better_in_each(problem: LikelihoodProblem, h: Hypothesis, other: Hypothesis) -> bool:
-    """Whether free runs are clearly better with a hypothesis than with another one, in each recording too."""
-    gain, z = paired_gain(h.blocks, other.blocks)
-    ends = np.cumsum(problem.block_counts)[:-1]
-    each = zip(*(np.split(x.blocks, ends) for x in (h, other)), strict=True)
-    better = gain / len(h.blocks) > FREE_RUN_BETTER and z > FREE_RUN_Z
+def _better_in_each(
+    a: Float[np.ndarray, " B"], b: Float[np.ndarray, " B"], counts: Sequence[int], asked: Sequence[int]
+) -> bool:
+    """Whether free runs are clearly better with model `a` than with model `b`, in each recording too.
+
+    Args:
+        a: Evidence of each block with model `a`.
+        b: Evidence of each block with model `b`.
+        counts: Number of blocks of each recording.
+        asked: Indices of the recordings that are compared.
+    """
+    ends = np.cumsum(counts)[:-1]
+    each = list(zip(np.split(a, ends), np.split(b, ends), strict=True))
+    each = [each[k] for k in asked]
+    together = [np.concatenate(blocks) for blocks in zip(*each, strict=True)]
+    gain, z = paired_gain(together[0], together[1])
+    better = gain / sum(counts[k] for k in asked) > FREE_RUN_BETTER and z > FREE_RUN_Z
     return better and all(paired_gain(*blocks)[1] > SUPPORT_Z for blocks in each)
 
 
-def own_friction_notes(s: SuperModel, h: Hypothesis) -> tuple[str, ...]:
-    """Sentences on sizes of friction that differ between the training runs, with their values."""
-    names, specs, values = s.mechanism.parameter_names, s.mechanism.parameter_specifications, h.values(s)
+def own_friction_notes(found: ValidatedHypothesis, validation: ValidationSet) -> tuple[str, ...]:
+    """Sentences on sizes of friction that differ between runs, with their values.
+
+    Args:
+        found: The final model.
+        validation: The validation recordings.
+    """
+    s, h, problem = validation.problem.supermodel, found.hypothesis, validation.problem
+    names, specs = s.mechanism.parameter_names, s.mechanism.parameter_specifications
+    unknown = [k for k, trained in enumerate(problem.trained) if trained is None]
+    each = {"training": h.values(s), "validation": found.adapted.values(s)[unknown]}
+
+    def where(i: int) -> str:
+        listed = {
+            f"the {kind} recording{'s' * (len(values) > 1)}": ", ".join(f"{v:.3g}" for v in values[:, i])
+            for kind, values in each.items()
+            if len(values)
+        }
+        return ", ".join(f"{values} {specs[i].unit} in {recordings}" for recordings, values in listed.items())
+
+    fitted = " The value in the validation data was fitted to them, and their errors are with it."
+    fitted = fitted if unknown else ""
     return tuple(
-        f"{names[i]} differs between the training recordings: "
-        + ", ".join(f"{v:.3g} {specs[i].unit}" for v in values[:, i])
-        + "; other parts of these runs get the value of their run, other runs the mean."
+        f"{names[i]} differs between runs: {where(i)}; other parts of these runs get the value of their run, "
+        "other runs the mean of the training recordings." + fitted
         for i in h.sizes
     )

@@ -1,7 +1,7 @@
 """What a search found, as data: stages, rounds, ranking, places of failure, a verdict."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -126,8 +126,9 @@ class Stage:
         calibrate_seconds: Length of the part of a recording to which its own offsets are fitted [s].
         of_validation: The model for each validation recording, with the phase of a periodic disturbance
             there and with the friction of its run; empty without either.
-        friction_of_runs: Sizes of friction that differ between the training recordings: name -> value in each
-            of them.
+        friction_of_runs: Sizes of friction that differ between runs: name -> value in each training
+            recording.
+        friction_of_validation: The same in each validation recording: that of its run, or fitted to it.
     """
 
     model: Model
@@ -147,6 +148,7 @@ class Stage:
     calibrate_seconds: float = 0.0
     of_validation: tuple[Model, ...] = ()
     friction_of_runs: dict[str, tuple[float, ...]] = dataclasses.field(default_factory=dict)
+    friction_of_validation: dict[str, tuple[float, ...]] = dataclasses.field(default_factory=dict)
 
     def model_on(self, i: int) -> Model:
         """The model for validation recording `i`."""
@@ -210,6 +212,10 @@ class KnownRuns(NamedTuple):
     def indices(self, recordings: Sequence[Recording]) -> tuple[int | None, ...]:
         """`index` of each recording."""
         return tuple(map(self.index, recordings))
+
+
+def _as_lists(values: Mapping[str, tuple[float, ...]]) -> dict[str, list[float]]:
+    return {name: list(each) for name, each in values.items()}
 
 
 def _parameters(estimates: Sequence[Estimate]) -> dict[str, Any]:
@@ -551,7 +557,8 @@ class SearchResult:
         """The model to use for a recording: `model` with the offsets and the friction known of its run.
 
         If the recording belongs to a run that was fitted, the model has the offsets of that run, and its
-        friction where this differs between runs. If it belongs to another run, the model lacks offsets that
+        friction where this differs between runs; without a final fit, it also has the friction of the run of
+        a validation recording. If it belongs to another run, the model lacks offsets that
         were seen in a single run only. Offsets that the final fit leaves out are in no model.
 
         Args:
@@ -571,6 +578,10 @@ class SearchResult:
             m = m.with_values(own)
         elif k is not None:
             m = m.with_values({name: each[k] for name, each in self.final.friction_of_runs.items()})
+        validated = KnownRuns(self.validation, runs.compared).index(recording)
+        if fit is None and k is None and validated is not None:
+            friction = self.final.friction_of_validation
+            m = m.with_values({name: each[validated] for name, each in friction.items()})
         return dataclasses.replace(self.model, mechanism=m)
 
     @property
@@ -628,7 +639,8 @@ class SearchResult:
             "noise_floor": json_numbers(self.noise_floor),
             "rounds": [r.to_dict() for r in self.rounds],
             "parameters": _parameters(self.final.estimates),
-            "friction_of_runs": {name: list(each) for name, each in self.final.friction_of_runs.items()},
+            "friction_of_runs": _as_lists(self.final.friction_of_runs),
+            "friction_of_validation": _as_lists(self.final.friction_of_validation),
             "ranking": [r.to_dict() for r in self.ranking],
             "where": [w.to_dict() for w in self.where],
             "next_experiment": self.proposal.to_dict(NEXT) if self.proposal else None,

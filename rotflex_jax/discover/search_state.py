@@ -15,7 +15,7 @@ from rotflex_jax.discover.checkpoint import (
     read_stages,
     restored,
 )
-from rotflex_jax.discover.friction_of_runs import baseline_with_own_friction
+from rotflex_jax.discover.friction_of_runs import validated_baseline
 from rotflex_jax.discover.hypothesis import Hypothesis, is_physical, law_with_its_size
 from rotflex_jax.discover.likelihood import LikelihoodProblem
 from rotflex_jax.discover.pairs import promising_pairs
@@ -269,7 +269,7 @@ def fit_as_it_is(model: Model, horizons: Horizons, say: Progress, digest: str) -
     say(beginning("baseline", "fitting the model as it is"))
     h = fit_baseline(horizons.prediction.problem)
     runs = fit_free_run_baseline(horizons.free_run.problem, h)
-    current = horizons.validated(*baseline_with_own_friction(horizons, h, runs))
+    current = validated_baseline(horizons, h, runs)
     state = SearchState(model, horizons, say, current, digest, passed=[current], tried=[current])
     state.reached("as it is")
     _check_baseline(state)

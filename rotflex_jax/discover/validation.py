@@ -139,7 +139,7 @@ class ValidatedHypothesis:
         """The hypothesis on the validation recordings, with the mean calibrations of training recordings.
 
         The phase of a periodic disturbance keeps its adapted value, since recordings never share it. Friction
-        keeps the size of the run.
+        that differs between runs keeps the size of the run.
 
         Args:
             s: The super-model of the hypothesis.
@@ -154,10 +154,34 @@ class ValidatedHypothesis:
         local_z[:, own] = self.adapted.local_z[:, own]
         return dataclasses.replace(self.adapted, local_z=local_z)
 
+    def of_runs(self, indices: Sequence[int | None]) -> list[Hypothesis]:
+        """The hypothesis for some recordings: one for each if friction differs between runs, else one.
+
+        Args:
+            indices: For each recording, the index of a validation recording of the same run, whose friction
+                it has; None if there is none.
+        """
+        h = self.hypothesis
+        return [h if k is None else with_friction_of(self.adapted, k, h) for k in indices] if h.sizes else [h]
+
     @property
     def log_likelihood(self) -> float:
         """Log-likelihood of the validation recordings [nat]."""
         return float(np.sum(self.blocks))
+
+
+def with_friction_of(adapted: Hypothesis, recording: int, h: Hypothesis) -> Hypothesis:
+    """A hypothesis with the friction of one run for all of its recordings.
+
+    Args:
+        adapted: The same structure on other recordings.
+        recording: Index of the one of them that belongs to the run.
+        h: The hypothesis.
+    """
+    local_z = h.local_z.copy()
+    for i in h.sizes:
+        local_z[:, h.local.index(i)] = adapted.local_z[recording, adapted.local.index(i)]
+    return dataclasses.replace(h, local_z=local_z)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -336,10 +360,11 @@ def validate(
     """Evaluate a trained hypothesis on validation recordings: log-likelihood in blocks, short free runs.
 
     Physics and process noise keep their trained values. First state and calibrations, which belong to one
-    recording, are fitted to it by least squares. The covariance of the innovations is estimated on the
-    validation recordings too. Where no model is complete, the covariance of the training recordings measures
-    how flexible a model is: a richer model has a smaller one, and would be penalised for it on other
-    recordings, however well it predicts them.
+    recording, are fitted to it by least squares. So is friction that differs between runs, if no recording of
+    the run was trained. The covariance of the innovations is estimated on the validation recordings too.
+    Where no model is complete, the covariance of the training recordings measures how flexible a model is: a
+    richer model has a smaller one, and would be penalised for it on other recordings, however well it
+    predicts them.
 
     Args:
         validation: The validation recordings.
@@ -362,14 +387,17 @@ def validate(
     if not np.all(np.isfinite(e)):
         lost = np.full_like(in_blocks(problem.seen, problem.dataset.data), DIVERGED)
         return ValidatedHypothesis(h, lost, current, np.full(e.shape[-1], np.inf))
-    current = adapted_to_recordings(problem, current)
+    current = adapted_to_recordings(problem, current, friction=True)
     blocks = problem.with_likelihood(current).blocks
     errors = validation.short_run_errors(current, h.locations, inner)
     return ValidatedHypothesis(h, blocks, current, errors)
 
 
 def adapted_to_recordings(
-    problem: LikelihoodProblem, h: Hypothesis, prior: Float[np.ndarray, " R"] | None = None
+    problem: LikelihoodProblem,
+    h: Hypothesis,
+    prior: Float[np.ndarray, " R"] | None = None,
+    friction: bool = False,
 ) -> Hypothesis:
     """The hypothesis with first states and calibrations fitted to each recording.
 
@@ -380,13 +408,16 @@ def adapted_to_recordings(
         h: Hypothesis from which the fit starts.
         prior: Weight, for each recording, of the sum of squares of its calibrations in unconstrained
             coordinates, where the unit is their usual size; zero if None.
+        friction: Whether friction that differs between runs is fitted too, to recordings of runs that were
+            not trained. The prior does not concern it.
     """
     seen, first = problem.seen, len(h.free)
     weight = np.zeros(len(h.x0)) if prior is None else prior
+    trained = problem.trained or (None,) * len(h.x0)
     coordinates = FitCoordinates(0, len(h.local), h.x0.shape[-1], problem.windows)
     own = [coordinates.of_recording(r) for r in range(len(h.x0))]
-    held = [h.local.index(i) for i in h.sizes]
-    fitted = [k for k in range(len(h.local)) if k not in held]
+    sizes = [h.local.index(i) for i in h.sizes]
+    offsets = [k for k in range(len(h.local)) if k not in sizes]
 
     def joined(points: list[_OwnStep]) -> Hypothesis:
         step = np.zeros(coordinates.size)
@@ -406,11 +437,12 @@ def adapted_to_recordings(
         for p in points:
             r, row = p.recording, own[p.recording]
             gradient, curvature = g[row], H[np.ix_(row, row)]
-            gradient[fitted] += weight[r] * here.local_z[r, fitted]
-            curvature[fitted, fitted] += weight[r]
-            gradient[held], curvature[held], curvature[:, held] = 0.0, 0.0, 0.0
-            curvature[held, held] = 1.0
-            cost = 0.5 * float(np.sum(w[r] ** 2) + weight[r] * np.sum(here.local_z[r, fitted] ** 2))
+            gradient[offsets] += weight[r] * here.local_z[r, offsets]
+            curvature[offsets, offsets] += weight[r]
+            if not friction or trained[r] is not None:
+                gradient[sizes], curvature[sizes], curvature[:, sizes] = 0.0, 0.0, 0.0
+                curvature[sizes, sizes] = 1.0
+            cost = 0.5 * float(np.sum(w[r] ** 2) + weight[r] * np.sum(here.local_z[r, offsets] ** 2))
             equations.append(NormalEquations(np.array([cost]), gradient, curvature))
         return equations
 
