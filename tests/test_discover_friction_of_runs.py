@@ -28,6 +28,7 @@ from rotflex_jax.discover.hypothesis import (
 from rotflex_jax.discover.likelihood import LikelihoodProblem, refit
 from rotflex_jax.discover.stepwise import fit_baseline, refit_candidates
 from rotflex_jax.discover.supermodel import EffectLocation
+from rotflex_jax.discover.tables import error_lists
 from rotflex_jax.discover.validation import Horizons, adapted_to_recordings, as_free_run, carried_over
 from rotflex_jax.models.model import Model
 from rotflex_jax.recording import Recording
@@ -172,6 +173,49 @@ def test_a_search_on_runs_with_different_friction():
         found.prediction_bands(validation[0])
     errors = np.array(list(found.final.held_out_rmse_windows.values()))
     assert np.all(errors < 1.3 * sp.NOISE)
+
+
+@pytest.fixture(scope="module")
+def between_runs() -> tuple[rf.Discovery, Recording]:
+    """A search that is trained on one run and validated on the beginning of the other, tested on its end."""
+    first, second = runs_with(LEVELS, seconds=6.0)
+    validation, test = second.split(0.6)
+    joint = rf.Model(sp.baseline(), sp.SOLVER)
+    wanted = [*WANTED[:1], (fx.Gravity, "hub")]
+    return rf.discover(joint, first, validation, test=test, candidates=wanted, rounds=1), test
+
+
+def test_a_validation_run_has_its_own_friction(between_runs: tuple[rf.Discovery, Recording]):
+    """With the trained level, its error over 2 s would be many times the noise, and friction be refused."""
+    found, test = between_runs
+    assert [r.effect for r in found.rounds] == ["coulomb"]
+    told = found.to_dict()
+    np.testing.assert_allclose(told["friction_of_runs"][LEVEL], LEVELS[:1], rtol=0.1)
+    np.testing.assert_allclose(told["friction_of_validation"][LEVEL], LEVELS[1:], rtol=0.1)
+    for errors in (found.final.held_out_rmse_windows, found.final.test.windows):  # pyright: ignore[reportOptionalMemberAccess]
+        assert np.all(np.array(list(errors.values())) < 1.3 * sp.NOISE)
+    assert found.model_of(test).mechanism.named_values[LEVEL] == pytest.approx(LEVELS[1], rel=0.1)
+    other = dataclasses.replace(test, continues=None)
+    assert found.model_of(other).mechanism.named_values[LEVEL] == pytest.approx(LEVELS[0], rel=0.1)
+
+
+def test_the_friction_of_a_validation_run_is_said_to_be_fitted(between_runs: tuple[rf.Discovery, Recording]):
+    found, _ = between_runs
+    (note,) = [n for n in found.notes if n.startswith(f"{LEVEL} differs between runs: ")]
+    assert "in the training recording, " in note and "in the validation recording; " in note
+    assert note.endswith("The value in the validation data was fitted to them, and their errors are with it.")
+    tables = {e.title: e.note for e in error_lists(found)}
+    assert "was fitted to those of a run that was not trained" in tables["Validation data"]
+    assert "was fitted" not in tables["Test data"]
+
+
+def test_a_validation_run_with_the_same_friction_has_the_trained_one():
+    first, second = runs_with((LEVELS[1], LEVELS[1]), seconds=5.0)
+    joint = rf.Model(sp.baseline(), sp.SOLVER)
+    found = rf.discover(joint, first, second, candidates=WANTED[:1], rounds=1)
+    assert [r.effect for r in found.rounds] == ["coulomb"]
+    assert not found.final.friction_of_validation
+    assert not any("differs between runs" in n for n in found.notes)
 
 
 def test_friction_of_the_users_model_may_differ_between_runs_too():

@@ -8,7 +8,14 @@ from typing import NamedTuple
 import numpy as np
 
 from rotflex_jax.discover.explanation import advice, coloured_sensors
-from rotflex_jax.discover.result import Ranked, Round, RunErrors, SearchResult, longest_recording
+from rotflex_jax.discover.result import (
+    KnownRuns,
+    Ranked,
+    Round,
+    RunErrors,
+    SearchResult,
+    longest_recording,
+)
 from rotflex_jax.discover.verdict import Grade, Verdict, grade
 from rotflex_jax.effects.base import full_name
 from rotflex_jax.effects.labels import effect_label, effect_phrase
@@ -116,6 +123,9 @@ def error_lists(discovery: SearchResult) -> list[NamedErrors]:
         for recordings in (discovery.validation, discovery.test)
     )
     chose, not_used = "The model was chosen on these recordings.", "Used for no fit and no choice."
+    runs = KnownRuns.of(discovery.train, discovery.validation)
+    if any(s.friction_of_validation for s in stages) and None in runs.indices(discovery.validation):
+        chose += " Friction that differs between runs was fitted to those of a run that was not trained."
     if not discovery.test:
         chose += " Test recordings (test=), used for no fit and no choice, would give an unbiased error."
     tested = (last.test, last.test_calibrated) if last else (None, None)
