@@ -169,7 +169,7 @@ def test_a_search_on_runs_with_different_friction():
     assert any(n.startswith(f"{LEVEL} differs between runs: ") for n in found.notes)
     run = found.model_of(validation[1]).mechanism.named_values[LEVEL]
     assert run == found.to_dict()["friction_of_runs"][LEVEL][1] == pytest.approx(LEVELS[1], rel=0.1)
-    with pytest.raises(rf.InputError, match=f"The training runs differ in {LEVEL}"):
+    with pytest.raises(rf.InputError, match=f"The runs differ in {LEVEL}"):
         found.prediction_bands(validation[0])
     errors = np.array(list(found.final.held_out_rmse_windows.values()))
     assert np.all(errors < 1.3 * sp.NOISE)
@@ -195,6 +195,8 @@ def test_a_validation_run_has_its_own_friction(between_runs: tuple[rf.Discovery,
     for errors in (found.final.held_out_rmse_windows, found.final.test.windows):  # pyright: ignore[reportOptionalMemberAccess]
         assert np.all(np.array(list(errors.values())) < 1.3 * sp.NOISE)
     assert found.model_of(test).mechanism.named_values[LEVEL] == pytest.approx(LEVELS[1], rel=0.1)
+    with pytest.raises(rf.InputError, match=f"The runs differ in {LEVEL}"):
+        found.prediction_bands(test)
     other = dataclasses.replace(test, continues=None)
     assert found.model_of(other).mechanism.named_values[LEVEL] == pytest.approx(LEVELS[0], rel=0.1)
 

@@ -1,6 +1,8 @@
 """Fits of long free runs with incomplete models, bounds, and sizes that the recordings do not reach."""
 
 import dataclasses
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -239,7 +241,8 @@ def test_a_search_leaves_out_candidates_of_sizes_that_no_signal_reaches():
     class Horizons:
         prediction = type("Prediction", (), {"problem": at})
 
-    state = SearchState(Model(sp.baseline()), Horizons, print, None)
+    present: Any = SimpleNamespace(hypothesis=sp.start(at), free_run=None)
+    state = SearchState(Model(sp.baseline()), Horizons, print, present)
     h = sp.start(at, locations=(*s.calibrations, location))
     assert is_physical(s, h, location) and state.is_plausible(h, location)
     reach = state.reach
@@ -249,6 +252,29 @@ def test_a_search_leaves_out_candidates_of_sizes_that_no_signal_reaches():
     z[:, list(s.local).index(s.parameter_indices(offset)[0])] = 1e4
     large = type(h)(**{**vars(h), "local_z": z})
     assert not state.is_plausible(large, offset) and is_physical(s, large, offset)
+
+
+@pytest.mark.parametrize(("present", "most"), [(0.0, 0.2), (0.05, 0.2), (-0.15, 0.3)])
+def test_a_search_leaves_out_candidates_that_need_a_large_offset(present: float, most: float):
+    """Four typical sizes of 0.05 V, or twice the offset of the present model, in any recording."""
+    at = sp.problem(sp.recordings(sp.records()))
+    s, location = at.supermodel, EffectLocation("coulomb", "hub")
+    column = list(s.local).index(s.mechanism.parameter_names.index("input.voltage_offset.offset"))
+
+    class Horizons:
+        prediction = type("Prediction", (), {"problem": at})
+
+    def with_offset(volts: float, *locations: EffectLocation) -> Hypothesis:
+        h = sp.start(at, locations=(*s.calibrations, *locations))
+        local_z = h.local_z.copy()
+        local_z[1, column] = volts / 0.05
+        return dataclasses.replace(h, local_z=local_z)
+
+    given: Any = SimpleNamespace(hypothesis=with_offset(present), free_run=None)
+    state = SearchState(Model(sp.baseline()), Horizons, print, given)
+    for sign in (-1, 1):
+        assert state.is_plausible(with_offset(sign * 0.98 * most, location), location)
+        assert not state.is_plausible(with_offset(sign * 1.02 * most, location), location)
 
 
 @pytest.mark.parametrize(("share", "plausible"), [(0.98, False), (1.02, True)])
@@ -283,7 +309,8 @@ def test_a_search_leaves_out_sensors_that_could_not_read_what_was_recorded(
         values[s.parameter_indices(location)] = cubic
         return dataclasses.replace(h, z=transform.unconstrain(values))
 
-    state = SearchState(Model(sp.baseline()), Horizons, print, None)
+    present: Any = SimpleNamespace(hypothesis=h, free_run=None)
+    state = SearchState(Model(sp.baseline()), Horizons, print, present)
     assert state.is_plausible(with_error(cubic), location) == plausible
     assert is_physical(s, with_error(cubic), location)
     assert state.is_plausible(with_error(10 * abs(cubic)), location)

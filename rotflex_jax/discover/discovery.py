@@ -18,7 +18,7 @@ from rotflex_jax.discover.explanation import (
     remaining_failures,
 )
 from rotflex_jax.discover.learned_torque import LearnedTorqueResult, learn_torque
-from rotflex_jax.discover.result import NEXT, SearchResult
+from rotflex_jax.discover.result import NEXT, KnownRuns, SearchResult
 from rotflex_jax.discover.tables import (
     channel_headings,
     channel_units,
@@ -157,15 +157,17 @@ class Discovery(SearchResult):
 
         Raises:
             InputError: As `rotflex_jax.prediction_bands`; or without a final fit, if friction differs between
-                the training runs.
+                runs, unless the recording is of the only run that was trained.
         """
         recording = single(recording, "recording", shortest=SHORTEST_TO_FIT)
         say, level, others = checks.progress(progress), checked_level(level), known_recordings(known)
         if self.final_fit:
             return bands_of_final_fit(self, recording, level, others)
-        if len(self.train) > 1 and (differs := ", ".join(self.final.friction_of_runs)):
+        differs = ", ".join(self.final.friction_of_runs)
+        known_run = KnownRuns.of(self.train, self.validation).index(recording) is not None
+        if differs and not (known_run and len(self.train) == 1):
             raise InputError(
-                f"The training runs differ in {differs}, but the probable sets are fitted with one friction "
+                f"The runs differ in {differs}, but the probable sets are fitted with one friction "
                 "for all runs; fit result.model_of(recording) to recordings of one run, and give this fit to "
                 "rf.prediction_bands."
             )

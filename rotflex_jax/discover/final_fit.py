@@ -119,7 +119,8 @@ class _Tried(NamedTuple):
 
     Attributes:
         fits: The fit to the training recordings; where runs validate each other, one fit without each run.
-        errors: Errors on the validation recordings, with the own offsets of each where these are calibrated.
+        errors: Errors on the validation recordings, with the own offsets of each where these are calibrated,
+            and with friction fitted to them where it differs from that of the training runs.
     """
 
     fits: Sequence[FittedStructure]
@@ -483,8 +484,9 @@ def _with_friction_of_other_runs(
     for k, h in enumerate(each):
         if known[k] is None:
             alone = validation.of_recordings([k])
-            adapted = adapted_to_recordings(alone, carried_over(alone, h), friction=True)
-            found[k] = with_friction_of(adapted, k, h)
+            start = alone.with_likelihood(carried_over(alone, h))  # with the size of errors of free runs
+            if np.isfinite(start.log_likelihood):
+                found[k] = with_friction_of(adapted_to_recordings(alone, start, friction=True), k, h)
     return found
 
 

@@ -33,8 +33,8 @@ from rotflex_jax.runtime.xla import on_threads
 # Number of candidates that are refitted in a round, to which the best one of each horizon is added, and
 # largest number of rounds.
 REFITTED, ROUNDS = 4, 4
-# Number of laws of dry friction that are refitted if the first round has tried none and adds nothing, or if
-# there are several runs. The simplest law at the same port is added to them.
+# Number of laws of dry friction that are refitted beside a model of the first round beside which none is
+# tried, if the round adds nothing or there are several runs. The simplest law at the same port is added.
 FRICTION_LAWS = 2
 
 
@@ -92,7 +92,9 @@ def _promising(state: SearchState, beside: ValidatedHypothesis) -> Promising:
 
 
 def add_dry_friction(state: SearchState, promising: Sequence[Promising]) -> bool:
-    """Add dry friction at a motor if the first round has tried none and adds nothing; False if none passes.
+    """Add dry friction at a motor if the first round adds nothing; False if none passes.
+
+    It is tried beside each model of the round beside which no dry friction was tried.
 
     Every machine has dry friction. But its slopes say little about it if the inertia or the damping of the
     model compensates for it, or if another missing effect explains far more. After an effect was found, no

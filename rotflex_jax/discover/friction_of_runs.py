@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from rotflex_jax.discover.hypothesis import CandidateStart, Hypothesis, with_own_friction
+from rotflex_jax.discover.hypothesis import CandidateStart, Hypothesis, is_physical, with_own_friction
 from rotflex_jax.discover.likelihood import refit
 from rotflex_jax.discover.selection import FREE_RUN_BETTER, FREE_RUN_Z, SUPPORT_Z, paired_gain
 from rotflex_jax.discover.stepwise import refit_from_contained
@@ -65,9 +65,10 @@ def refit_with_own_friction(horizons: Horizons, refits: Refits, starts: Sequence
 def validated_with_own_friction(
     horizons: Horizons, found: ValidatedHypothesis, near: ValidatedHypothesis | None = None
 ) -> ValidatedHypothesis:
-    """A model whose friction also has its own size in validation runs that were not trained.
+    """A model of one training recording, with friction of its own size in validation runs of other runs.
 
-    It is the given model unless free runs over each of these runs are clearly better so.
+    It is the given model unless free runs over each of these validation recordings are clearly better so.
+    Several training recordings show by themselves whether friction differs (`refit_with_own_friction`).
 
     Args:
         horizons: Training and validation recordings at both horizons.
@@ -79,12 +80,15 @@ def validated_with_own_friction(
     assert found.free_run and found.location
     s, fits = validation.problem.supermodel, (found.hypothesis, found.free_run.hypothesis)
     own = [with_own_friction(s, h, found.location) for h in fits]
-    if not unknown or any(h.sizes == before.sizes for h, before in zip(own, fits, strict=True)):
+    if not unknown or horizons.free_run.problem.block_counts[1:]:
+        return found
+    if any(h.sizes == before.sizes for h, before in zip(own, fits, strict=True)):
         return found
     tried = horizons.validated(own[0], own[1], near)
     assert tried.free_run
     counts = validation.problem.block_counts
-    if not _better_in_each(tried.free_run.blocks, found.free_run.blocks, counts, unknown):
+    physical = all(is_physical(s, v.adapted, found.location) for v in (tried, tried.free_run))
+    if not (physical and _better_in_each(tried.free_run.blocks, found.free_run.blocks, counts, unknown)):
         return found
     return dataclasses.replace(tried, location=found.location, parameter_count=found.parameter_count)
 
@@ -154,6 +158,6 @@ def own_friction_notes(found: ValidatedHypothesis, validation: ValidationSet) ->
     fitted = fitted if unknown else ""
     return tuple(
         f"{names[i]} differs between runs: {where(i)}; other parts of these runs get the value of their run, "
-        "other runs the mean of the training recordings." + fitted
+        f"other runs {'the mean' if len(each['training']) > 1 else 'the value'} of the training data.{fitted}"
         for i in h.sizes
     )

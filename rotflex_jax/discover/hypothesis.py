@@ -95,7 +95,8 @@ class Hypothesis:
         local: Indices of fitted parameters that have a value for each recording: calibrations, and sizes of
             friction that differ between runs.
         sizes: Those of `local` that are sizes of friction. Other recordings of a run have the size of the
-            run, while calibrations are fitted to every recording.
+            run, while calibrations are fitted to every recording. For a validation recording of a run that
+            was not trained, sizes are fitted too.
         z: Unconstrained values of all parameters.
         local_z: Unconstrained values of the local parameters of each recording.
         x0: First states of the windows: positions, speeds, and further states of the reduced model.

@@ -125,7 +125,7 @@ class Stage:
             `calibrate_seconds`.
         calibrate_seconds: Length of the part of a recording to which its own offsets are fitted [s].
         of_validation: The model for each validation recording, with the phase of a periodic disturbance
-            there and with the friction of its run; empty without either.
+            there and with the friction of its run, which may have been fitted there; empty without either.
         friction_of_runs: Sizes of friction that differ between runs: name -> value in each training
             recording.
         friction_of_validation: The same in each validation recording: that of its run, or fitted to it.
@@ -251,7 +251,8 @@ class FinalFit:
             one recording here (`recording.joined`), since they share the offsets of their run.
         model: The model of the fit, without what belongs to single recordings.
         trained: Errors on validation recordings of the same structure, fitted in the same way to the training
-            recordings alone; with the own offsets of each recording where offsets are calibrated.
+            recordings alone; with the own offsets of each recording where offsets are calibrated, and with
+            friction fitted to a validation run where it differs from that of the training runs.
         searched: The same errors of the final model with the parameters of the search.
         test: Errors on test recordings, if there are any.
         test_calibrated: Errors on test recordings with the own offsets of each recording.

@@ -82,9 +82,10 @@ def discover(
         mechanism: The user's model; its parameter values are the start.
         train: Training recordings, to which models are fitted.
         validation: Validation recordings, which decide between models; no model is fitted to them before it
-            is chosen. For the comparison of likelihoods, only first states and offsets are fitted to them.
-            For reported errors, first states come from the first `n_init` samples, and size and phase of a
-            periodic disturbance from the whole recording. They also help to estimate the noise of the
+            is chosen. For the comparison of likelihoods, only first states and offsets are fitted to them,
+            and friction that differs from that of the training run if they are of another run. For reported
+            errors, first states come from the first `n_init` samples, and such friction and size and phase of
+            a periodic disturbance from the whole recording. They also help to estimate the noise of the
             sensors. The final model is fitted to them once, to compare its parameters. If the search ends
             unexplained, `Discovery.model` is fitted to them as well. Without validation recordings, every
             training recording validates what was fitted to the others.

@@ -5,6 +5,8 @@ import functools
 from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 
+import numpy as np
+
 from rotflex_jax.discover.checkpoint import (
     AddedEffect,
     KeptStage,
@@ -48,6 +50,10 @@ from rotflex_jax.fit.plausibility import Reach, beyond_recordings
 from rotflex_jax.models.model import Model
 
 Progress = Callable[[str], None]
+
+# An effect is not plausible if it needs an offset or bias of more than this many typical sizes: 0.2 V or
+# 0.04 rad.
+LARGEST_OFFSET = 4.0
 
 
 @dataclasses.dataclass
@@ -128,16 +134,31 @@ class SearchState:
     def is_plausible(self, h: Hypothesis, location: EffectLocation) -> bool:
         """Whether the parameters of an effect are physical, and of sizes that the recordings reach.
 
-        A sensor is not physical if readings as large as the recorded ones correspond to no true value.
+        A sensor is not physical if readings as large as the recorded ones correspond to no true value. An
+        effect is not plausible either if an offset cancels a part of it (`_needs_large_offset`).
         """
         s = self.problem.supermodel
-        if not is_physical(s, h, location):
+        if not is_physical(s, h, location) or self._needs_large_offset(h):
             return False
         m = s.clean(h.mean_values(s), h.locations)
         effect = m.effect(*location)
         if isinstance(effect, Sensing) and self.reach.position[effect.at] > effect.largest_reading():
             return False
         return not beyond_recordings(m, self.reach, [effect])
+
+    def _needs_large_offset(self, h: Hypothesis) -> bool:
+        """Whether an offset is far beyond its typical size, and over twice as large as in the present model.
+
+        Over a small angle, a large gravity torque and the offset that cancels it are a weak spring. Together
+        they follow the errors of the recording, and fail where the angle is another one.
+        """
+        s, fits = self.problem.supermodel, [self.current, *filter(None, [self.current.free_run])]
+        for i in [i for p in s.calibrations for i in s.parameter_indices(p) if i in h.local]:
+            known = [np.abs(v.hypothesis.values(s)[:, i]).max() for v in fits if i in v.hypothesis.local]
+            typical = s.mechanism.parameter_specifications[i].typical
+            if np.abs(h.values(s)[:, i]).max() > max([LARGEST_OFFSET * typical, *(2 * x for x in known)]):
+                return True
+        return False
 
     @property
     def problem(self) -> LikelihoodProblem:

@@ -123,8 +123,7 @@ def error_lists(discovery: SearchResult) -> list[NamedErrors]:
         for recordings in (discovery.validation, discovery.test)
     )
     chose, not_used = "The model was chosen on these recordings.", "Used for no fit and no choice."
-    runs = KnownRuns.of(discovery.train, discovery.validation)
-    if any(s.friction_of_validation for s in stages) and None in runs.indices(discovery.validation):
+    if fitted_friction(discovery):
         chose += " Friction that differs between runs was fitted to those of a run that was not trained."
     if not discovery.test:
         chose += " Test recordings (test=), used for no fit and no choice, would give an unbiased error."
@@ -146,6 +145,12 @@ def error_lists(discovery: SearchResult) -> list[NamedErrors]:
         if errors:
             found.append(NamedErrors(title, note, errors | ({FITTED_TO_ALL: of_fit} if of_fit else {})))
     return found
+
+
+def fitted_friction(discovery: SearchResult) -> bool:
+    """Whether friction of a stage was fitted to validation recordings, which are of another run."""
+    runs = KnownRuns.of(discovery.train, discovery.validation).indices(discovery.validation)
+    return None in runs and any(s.friction_of_validation for s in discovery.stages)
 
 
 def _own_offsets(seconds: float, recordings: Sequence[Recording]) -> str:
@@ -197,11 +202,10 @@ def final_fit_sentence(discovery: SearchResult) -> str:
         for name, each in found.fit.local.items()
         if name in found.friction
     )
-    friction = (
-        f" Each run has a friction of its own size, without which every run is worse by far: {sizes}."
-        if sizes
-        else ""
-    )
+    searched = discovery.final.friction_of_runs
+    found_by = "as the search has found" if searched else "without which every run is worse by far"
+    apart = ", apart from their friction" if fitted_friction(discovery) else ""
+    friction = f" Each run has a friction of its own size, {found_by}: {sizes}." if sizes else ""
     needless = " and ".join(effect_phrase(*p) for p in found.left_out)
     pronoun = "it" if len(found.left_out) == 1 else "them"
     left_out = (
@@ -218,7 +222,7 @@ def final_fit_sentence(discovery: SearchResult) -> str:
     return (
         f"The model to use is the last one, fitted to {used} together, by free runs over {seconds:g} s "
         f"{first}.{left_out}{laws}{friction} Fitted in the same way without the validation "
-        f"data, its errors on these over {seconds:g} s are {', '.join(shown)}{own}.{ending}{remarks}"
+        f"data{apart}, its errors on these over {seconds:g} s are {', '.join(shown)}{own}.{ending}{remarks}"
     )
 
 

@@ -105,8 +105,8 @@ class ShortRuns:
         return out
 
 
-# Rules of the fit of first states and calibrations. The problem is nearly linear, so the damping is small
-# from the start, but not zero: recordings need not determine every state.
+# Rules of the fit of first states, calibrations and friction. The problem is nearly linear, so the damping is
+# small from the start, but not zero: recordings need not determine every state.
 ADAPTATION_RULES = Rules(enough=0.05, damping=1e-6, least=1e-6, increase=30)
 MAX_ADAPTATION_STEPS = 20
 
@@ -118,7 +118,8 @@ class ValidatedHypothesis:
     Attributes:
         hypothesis: The hypothesis, fitted to the training recordings.
         blocks: Evidence of each half second of the validation recordings, as in `Hypothesis.blocks`.
-        adapted: The same physics with first states and calibrations of the validation recordings.
+        adapted: The same physics with first states and calibrations of the validation recordings, and with
+            their friction where it differs between runs.
         window_rmse: Root mean square error of short free runs, by channel.
         location: The effect by which it exceeds the hypothesis that it is compared with.
         parameter_count: Number of parameters of this effect.
@@ -138,8 +139,8 @@ class ValidatedHypothesis:
     def with_trained_calibrations(self, s: SuperModel) -> Hypothesis:
         """The hypothesis on the validation recordings, with the mean calibrations of training recordings.
 
-        The phase of a periodic disturbance keeps its adapted value, since recordings never share it. Friction
-        that differs between runs keeps the size of the run.
+        The phase of a periodic disturbance keeps its adapted value, since recordings never share it. So does
+        friction that differs between runs: it has the size of the run, or was fitted to the recording.
 
         Args:
             s: The super-model of the hypothesis.
@@ -399,7 +400,7 @@ def adapted_to_recordings(
     prior: Float[np.ndarray, " R"] | None = None,
     friction: bool = False,
 ) -> Hypothesis:
-    """The hypothesis with first states and calibrations fitted to each recording.
+    """The hypothesis with first states and calibrations fitted to each recording, and friction if asked for.
 
     The recordings are independent problems, but one call of the predictor evaluates all of them.
 
@@ -408,12 +409,12 @@ def adapted_to_recordings(
         h: Hypothesis from which the fit starts.
         prior: Weight, for each recording, of the sum of squares of its calibrations in unconstrained
             coordinates, where the unit is their usual size; zero if None.
-        friction: Whether friction that differs between runs is fitted too, to recordings of runs that were
-            not trained. The prior does not concern it.
+        friction: Whether friction that differs between runs is fitted too, to validation recordings of runs
+            that were not trained. The prior does not concern it. Where training recordings validate each
+            other, it is never fitted.
     """
     seen, first = problem.seen, len(h.free)
     weight = np.zeros(len(h.x0)) if prior is None else prior
-    trained = problem.trained or (None,) * len(h.x0)
     coordinates = FitCoordinates(0, len(h.local), h.x0.shape[-1], problem.windows)
     own = [coordinates.of_recording(r) for r in range(len(h.x0))]
     sizes = [h.local.index(i) for i in h.sizes]
@@ -439,7 +440,7 @@ def adapted_to_recordings(
             gradient, curvature = g[row], H[np.ix_(row, row)]
             gradient[offsets] += weight[r] * here.local_z[r, offsets]
             curvature[offsets, offsets] += weight[r]
-            if not friction or trained[r] is not None:
+            if not (friction and problem.trained and problem.trained[r] is None):
                 gradient[sizes], curvature[sizes], curvature[:, sizes] = 0.0, 0.0, 0.0
                 curvature[sizes, sizes] = 1.0
             cost = 0.5 * float(np.sum(w[r] ** 2) + weight[r] * np.sum(here.local_z[r, offsets] ** 2))
