@@ -80,7 +80,7 @@ def validated_with_own_friction(
     assert found.free_run and found.location
     s, fits = validation.problem.supermodel, (found.hypothesis, found.free_run.hypothesis)
     own = [with_own_friction(s, h, found.location) for h in fits]
-    if not unknown or horizons.free_run.problem.block_counts[1:]:
+    if not unknown or len(horizons.free_run.problem.dataset.recordings) > 1:
         return found
     if any(h.sizes == before.sizes for h, before in zip(own, fits, strict=True)):
         return found
