@@ -210,9 +210,8 @@ def evaluate(
     every = range(len(validation.problem.dataset.recordings))
     runs = free_runs(validation, [validation.model_of(trained, locations, i) for i in every])
     differ = s.phased.intersection(h.local).union(h.sizes)
-    of_each = [s.clean(trained.values(s)[i], locations) for i in every] if differ else []
-    values, names = h.values(s), s.mechanism.parameter_names
-    adapted = trained.values(s)
+    values, adapted, names = h.values(s), trained.values(s), s.mechanism.parameter_names
+    of_each = [s.clean(adapted[i], locations) for i in every] if differ else []
     of_validation = {names[i]: tuple(adapted[:, i].tolist()) for i in h.sizes if not validation.folds}
     return Stage(
         model=Model(s.clean(h.mean_values(s), locations), solver),

@@ -248,10 +248,9 @@ class _FinalFitBuilder:
             else:
                 validation = self.evaluation.validation.problem
                 runs = self.runs._replace(recordings=tuple(parts[0]))
-                known = runs.indices(validation.dataset.recordings)
-                each = own[0].as_hypotheses(known)
+                each = own[0].as_hypotheses(runs.indices(validation.dataset.recordings))
                 if structure.hypothesis.sizes:
-                    each = _with_friction_of_other_runs(validation, each, known)
+                    each = _with_friction_of_other_runs(validation, each)
             tried.append(_Tried(own, _on_validation(structure, each, self.evaluation)))
         return tried
 
@@ -471,22 +470,20 @@ def _without_each(train: Sequence[Recording]) -> list[list[Recording]]:
 
 
 def _with_friction_of_other_runs(
-    validation: LikelihoodProblem, each: Sequence[Hypothesis], known: Sequence[int | None]
+    validation: LikelihoodProblem, each: Sequence[Hypothesis]
 ) -> list[Hypothesis]:
     """Hypotheses for validation recordings, with friction fitted to those of runs that were not trained.
 
     Args:
         validation: Likelihood of free runs over the recordings.
         each: One hypothesis for each recording.
-        known: For each recording, the index of a training recording of the same run; None if there is none.
     """
     found = list(each)
-    for k, h in enumerate(each):
-        if known[k] is None:
-            alone = validation.of_recordings([k])
-            start = alone.with_likelihood(carried_over(alone, h))  # with the size of errors of free runs
-            if np.isfinite(start.log_likelihood):
-                found[k] = with_friction_of(adapted_to_recordings(alone, start, friction=True), k, h)
+    for k in validation.of_other_runs:
+        alone = validation.of_recordings([k])
+        start = alone.with_likelihood(carried_over(alone, each[k]))  # with the size of errors of free runs
+        if np.isfinite(start.log_likelihood):
+            found[k] = with_friction_of(adapted_to_recordings(alone, start, friction=True), k, each[k])
     return found
 
 

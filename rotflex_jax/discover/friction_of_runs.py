@@ -76,12 +76,12 @@ def validated_with_own_friction(
         near: See `Horizons.validated`.
     """
     validation = horizons.free_run.validation
-    unknown = [k for k, trained in enumerate(validation.problem.trained) if trained is None]
+    unknown = validation.problem.of_other_runs
+    if not unknown or len(horizons.free_run.problem.dataset.recordings) > 1:
+        return found
     assert found.free_run and found.location
     s, fits = validation.problem.supermodel, (found.hypothesis, found.free_run.hypothesis)
     own = [with_own_friction(s, h, found.location) for h in fits]
-    if not unknown or len(horizons.free_run.problem.dataset.recordings) > 1:
-        return found
     if any(h.sizes == before.sizes for h, before in zip(own, fits, strict=True)):
         return found
     tried = horizons.validated(own[0], own[1], near)
@@ -143,7 +143,7 @@ def own_friction_notes(found: ValidatedHypothesis, validation: ValidationSet) ->
     """
     s, h, problem = validation.problem.supermodel, found.hypothesis, validation.problem
     names, specs = s.mechanism.parameter_names, s.mechanism.parameter_specifications
-    unknown = [k for k, trained in enumerate(problem.trained) if trained is None]
+    unknown = problem.of_other_runs
     each = {"training": h.values(s), "validation": found.adapted.values(s)[unknown]}
 
     def where(i: int) -> str:
@@ -154,8 +154,8 @@ def own_friction_notes(found: ValidatedHypothesis, validation: ValidationSet) ->
         }
         return ", ".join(f"{values} {specs[i].unit} in {recordings}" for recordings, values in listed.items())
 
-    fitted = " The value in the validation data was fitted to them, and their errors are with it."
-    fitted = fitted if unknown else ""
+    sentence = " The value in the validation data was fitted to them, and their errors are with it."
+    fitted = sentence if unknown else ""
     return tuple(
         f"{names[i]} differs between runs: {where(i)}; other parts of these runs get the value of their run, "
         f"other runs {'the mean' if len(each['training']) > 1 else 'the value'} of the training data.{fitted}"

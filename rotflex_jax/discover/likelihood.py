@@ -123,6 +123,11 @@ class LikelihoodProblem:
         return not all(of_one_run(first, other) for other in others)
 
     @property
+    def of_other_runs(self) -> list[int]:
+        """Indices of the validation recordings of runs that were not trained; none of other recordings."""
+        return [k for k, trained in enumerate(self.trained) if trained is None]
+
+    @property
     def block_counts(self) -> list[int]:
         """Number of blocks of each recording."""
         return [len(sums) for sums in _in_blocks_of_each(self.seen, self.dataset.data)]

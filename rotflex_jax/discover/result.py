@@ -569,6 +569,13 @@ class SearchResult:
         fit = self.final_fit.fit if self.final_fit else None
         fitted = self.final_fit.recordings if self.final_fit else self.train
         k = runs._replace(recordings=fitted).index(recording)
+        if fit is None:
+            friction, of_run = self.final.friction_of_runs, k
+            if k is None:
+                of_run = runs._replace(recordings=self.validation).index(recording)
+                friction = self.final.friction_of_validation
+            if of_run is not None:
+                m = m.with_values({name: each[of_run] for name, each in friction.items()})
         if k is None and not runs.compared:
             for location in self.offsets:
                 m = m.without(*location)
@@ -577,12 +584,6 @@ class SearchResult:
                 return fit.model_of(k)
             own = {name: each[k].value for name, each in fit.local.items() if name in m.parameter_names}
             m = m.with_values(own)
-        elif k is not None:
-            m = m.with_values({name: each[k] for name, each in self.final.friction_of_runs.items()})
-        validated = KnownRuns(self.validation, runs.compared).index(recording)
-        if fit is None and k is None and validated is not None:
-            friction = self.final.friction_of_validation
-            m = m.with_values({name: each[validated] for name, each in friction.items()})
         return dataclasses.replace(self.model, mechanism=m)
 
     @property

@@ -152,13 +152,18 @@ class SearchState:
         Over a small angle, a large gravity torque and the offset that cancels it are a weak spring. Together
         they follow the errors of the recording, and fail where the angle is another one.
         """
-        s, fits = self.problem.supermodel, [self.current, *filter(None, [self.current.free_run])]
+        s = self.problem.supermodel
         for i in [i for p in s.calibrations for i in s.parameter_indices(p) if i in h.local]:
-            known = [np.abs(v.hypothesis.values(s)[:, i]).max() for v in fits if i in v.hypothesis.local]
+            known = [np.abs(fit.values(s)[:, i]).max() for fit in self.fits if i in fit.local]
             typical = s.mechanism.parameter_specifications[i].typical
             if np.abs(h.values(s)[:, i]).max() > max([LARGEST_OFFSET * typical, *(2 * x for x in known)]):
                 return True
         return False
+
+    @property
+    def fits(self) -> list[Hypothesis]:
+        """The present model, fitted to predictions and, where it was, to free runs."""
+        return [v.hypothesis for v in (self.current, self.current.free_run) if v]
 
     @property
     def problem(self) -> LikelihoodProblem:
@@ -308,8 +313,7 @@ def _check_baseline(state: SearchState) -> None:
     state.reading_notes = notes
     for line in notes:
         state.say(line)
-    fits = [v.hypothesis for v in (state.current, state.current.free_run) if v]
-    if any(far_from_given(state.problem.supermodel, h) for h in fits):
+    if any(far_from_given(state.problem.supermodel, h) for h in state.fits):
         state.nominal = as_given(state.horizons)
 
 

@@ -229,8 +229,7 @@ def _step(
     penalised = NormalEquations(np.array([before]), free.T @ g, free.T @ H @ free)
     # Outputs are linear in the weights but not in the physics.
     limit = np.full(free.shape[1], np.inf)
-    physics = equations.physics
-    limit[np.searchsorted(rest, physics)] = problem.step_limits(h)[physics]
+    limit[np.searchsorted(rest, equations.physics)] = problem.step_limits(h)[equations.physics]
     progress = begin(before, MAP_RULES._replace(damping=damping))
     for _ in range(TRIALS_PER_STEP):
         step, _ = penalised.step(float(progress.damping), limit)

@@ -440,7 +440,7 @@ def adapted_to_recordings(
             gradient, curvature = g[row], H[np.ix_(row, row)]
             gradient[offsets] += weight[r] * here.local_z[r, offsets]
             curvature[offsets, offsets] += weight[r]
-            if not (friction and problem.trained and problem.trained[r] is None):
+            if not (friction and r in problem.of_other_runs):
                 gradient[sizes], curvature[sizes], curvature[:, sizes] = 0.0, 0.0, 0.0
                 curvature[sizes, sizes] = 1.0
             cost = 0.5 * float(np.sum(w[r] ** 2) + weight[r] * np.sum(here.local_z[r, offsets] ** 2))

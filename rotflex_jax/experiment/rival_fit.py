@@ -13,7 +13,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from rotflex_jax.checks import shown
 from rotflex_jax.effects import CATALOG
@@ -272,6 +272,19 @@ def _static_and_arrays(model: RivalModel) -> tuple[_StaticRival, Any]:
     return _StaticRival(model.mechanism.structure, model.solver, model.free), arrays
 
 
+def limits_of_unknowns(
+    bounded: Bool[np.ndarray, " P"], x: Float[np.ndarray, " D"]
+) -> Float[np.ndarray, " D"]:
+    """Largest step of the unknowns of a rival from a start: `step_limits` of parameters, which come first.
+
+    Args:
+        bounded: Whether each of the P parameters has a bound.
+        x: The start.
+    """
+    parameters = step_limits(bounded, x[: len(bounded)])
+    return np.concatenate([parameters, np.full(len(x) - len(bounded), np.inf)])
+
+
 def fit_rival(
     rival: RivalModel,
     u: Float[np.ndarray, " N"],
@@ -299,9 +312,7 @@ def fit_rival(
             return _Linearisation(np.asarray(w), np.asarray(J))
 
         first = rival.start if start is None else start
-        m = len(rival.free)
-        parameters = step_limits(rival.transform.bounded[list(rival.free)], first[:m])
-        limit = np.concatenate([parameters, np.full(len(first) - m, np.inf)])
+        limit = limits_of_unknowns(rival.transform.bounded[list(rival.free)], first)
         found = minimise(linearised, first, RULES, limit=limit, max_steps=MAX_STEPS - 1)
     steps = found.evaluations + 1
     if found.status == Status.DIVERGED:

@@ -17,11 +17,11 @@ import numpy as np
 import scipy
 from jaxtyping import Array, Float, Int
 
-from rotflex_jax.experiment.rival_fit import MAX_STEPS, RULES, with_calibrations
+from rotflex_jax.experiment.rival_fit import MAX_STEPS, RULES, limits_of_unknowns, with_calibrations
 from rotflex_jax.mechanism import Mechanism, Solver, free_run, kalman_gains, linearise, predictor_run
 from rotflex_jax.mechanism.assembly import Layout, rest_state
 from rotflex_jax.models.model import Model
-from rotflex_jax.optimise.damped_least_squares import NormalEquations, minimise, step_limits
+from rotflex_jax.optimise.damped_least_squares import NormalEquations, minimise
 from rotflex_jax.parameters import Transform
 from rotflex_jax.runtime.persistent_jit import persistent_jit
 from rotflex_jax.runtime.xla import double_precision
@@ -374,17 +374,17 @@ class RivalSet:
 
         Arguments as in `posterior`.
         """
-        m, bounded = len(self.free[h]), self.transform.bounded[list(self.free[h])]
-
-        def limit(x: np.ndarray) -> np.ndarray:
-            return np.concatenate([step_limits(bounded, x[:m]), np.full(len(x) - m, np.inf)])
+        bounded = self.transform.bounded[list(self.free[h])]
 
         def equations(x: np.ndarray) -> NormalEquations:
             p = self.posterior(h, x, runs, place, first)
             return NormalEquations(np.array([p.cost + p.prior_cost]), p.gradient, p.information + p.precision)
 
         best = min(
-            (minimise(equations, x, RULES, limit=limit(x), max_steps=MAX_STEPS) for x in starts),
+            (
+                minimise(equations, x, RULES, limit=limits_of_unknowns(bounded, x), max_steps=MAX_STEPS)
+                for x in starts
+            ),
             key=lambda found: float(found.cost) if np.isfinite(found.cost) else math.inf,
         )
         return self.posterior(h, best.x, runs, place, first)

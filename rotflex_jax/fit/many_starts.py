@@ -159,7 +159,6 @@ def _minimise_each(
     tolerance: float,
 ) -> StartResults:
     transform = Transform.of(structure.parameter_specifications)
-    bounded = transform.bounded
 
     def values(z: Array) -> Array:
         whole = jnp.zeros_like(inputs.values).at[inputs.free].set(z)
@@ -182,7 +181,7 @@ def _minimise_each(
             linearise,
             start,
             Rules(enough_share=tolerance),
-            limit=step_limits(jnp.asarray(bounded)[inputs.free], start[0]),
+            limit=step_limits(jnp.asarray(transform.bounded)[inputs.free], start[0]),
             max_steps=max_steps,
         )
         return StartResults(values(z), x0, equations.cost, progress.evaluations, z)
