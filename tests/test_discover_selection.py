@@ -229,6 +229,55 @@ def test_of_what_cannot_be_told_apart_dry_friction_goes_first():
         assert (choose([drag, slower], BASE, MEASURED, NOISE)[0] is slower) is first
 
 
+def dead_zone_before_friction(
+    share: float = 0.8, z: float = 0.0, worse: float = 1.0
+) -> list[ValidatedHypothesis]:
+    """A dead zone that predictions prefer, and Coulomb friction; both stop the machine for a while.
+
+    Args:
+        share: Gain of friction in predictions as a share of the gain of the dead zone.
+        z: Standard deviations by which free runs prefer the dead zone.
+        worse: Errors of free runs with friction over those with the dead zone.
+    """
+    runs = {"held_out": 50.0, "train": 50.0, "windows": 4.0 * worse}
+    ahead = {"held_out": 60.0, "train": 60.0, "windows": 4.0, "scatter": scatter_for(z, 10.0) if z else 0.0}
+    gain = {"held_out": 1000.0, "train": 1000.0, "windows": 5.0}
+    less = {"held_out": 1000.0 * share, "train": 1000.0 * share, "windows": 8.0}
+    leading = at_both(gain, ahead if z else runs | {"windows": 4.0}, EffectLocation("dead_zone", "input"))
+    return [leading, at_both(less, runs, COULOMB)]
+
+
+@pytest.mark.parametrize(
+    ("changes", "first"),
+    [
+        ({"share": 0.75 * 1.002}, "coulomb"),
+        ({"share": 0.75 * 0.998}, "dead_zone"),
+        ({"z": 1.99}, "coulomb"),
+        ({"z": 2.01}, "dead_zone"),
+        ({"z": 1.0, "worse": np.exp(0.099)}, "coulomb"),
+        ({"z": 1.0, "worse": np.exp(0.101)}, "dead_zone"),
+    ],
+)
+def test_in_a_poor_model_dry_friction_comes_before_what_free_runs_do_not_prefer(
+    changes: dict[str, float], first: str
+) -> None:
+    both = dead_zone_before_friction(**changes)
+    winner, rivals = choose(both, FAR, MEASURED, NOISE)
+    assert winner.location.effect == first
+    # What predictions prefer is reported beside friction.
+    assert rivals == (both[:1] if first == "coulomb" else [])
+
+
+def test_near_the_noise_predictions_decide_between_dry_friction_and_another_effect() -> None:
+    leading, friction = (
+        dataclasses.replace(
+            v, window_rmse=1.5 * NOISE, free_run=dataclasses.replace(v.free_run, window_rmse=NOISE)
+        )
+        for v in dead_zone_before_friction()
+    )
+    assert choose([leading, friction], FAR, MEASURED, NOISE) == (leading, [])
+
+
 def test_a_rival_need_not_pass_what_the_winner_passed():
     """A candidate that just fails is reported beside the winner if the two are not distinguished."""
     best = trial(DRAG, **GOOD | {"held_out": 30.0, "train": 30.0, "scatter": 1.0}, seed=1)

@@ -47,6 +47,9 @@ SEPARATE_Z, WINDOWS_APART = 2.0, 0.1
 # smaller by this share. Whatever else the model lacks may cause a smaller difference between two effects that
 # do nearly the same.
 GAIN_APART = 0.1
+# Every machine has dry friction. In a poor model it is chosen before a leading effect from which free runs do
+# not distinguish it, if its gain in predictions is at least this share of the gain of that effect.
+FRICTION_SHARE = 0.75
 # An effect that predictions do not prefer must be preferred by free runs: by this many standard deviations of
 # the block gains, on validation and on training data, and with errors smaller by this (mean log ratio).
 FREE_RUN_Z, FREE_RUN_BETTER = 2.5, 0.1
@@ -258,14 +261,43 @@ def choose(
     # parameters of predictions is excepted: such an effect may imitate another one.
     first = _plausibility(winner)
     others = [t for t in able if not _related(t, winner) and _plausibility(t) < first]
-    others = [t for t in others if _log_error_ratio(t, winner) <= WINDOWS_APART]
-    if alike := [t for t in others if _alike(winner, t, current, noise)]:
+
+    def replaces_winner(t: ValidatedHypothesis) -> bool:
+        like = _log_error_ratio(t, winner) <= WINDOWS_APART and _alike(winner, t, current, noise)
+        return like or _friction_comes_first(winner, t, current, noise)
+
+    if alike := [t for t in others if replaces_winner(t)]:
         winner = simplest(min(alike, key=lambda t: (*_plausibility(t), -shares[t.location])))
     rivals = [t for t in candidates if t is not winner and not _related(t, winner)]
     gains = [
         t for t in rivals if t.log_likelihood > current.log_likelihood and _training_gain(t, current)[0] > 0
     ]
     return winner, [t for t in gains if _alike(winner, t, current, noise)]
+
+
+def _friction_comes_first(
+    winner: ValidatedHypothesis,
+    rival: ValidatedHypothesis,
+    current: ValidatedHypothesis,
+    noise: Float[np.ndarray, " C"],
+) -> bool:
+    """Whether a rival is dry friction that is chosen before a leading effect of another kind.
+
+    In a poor model predictions do not decide between the two. Friction that differs between runs has one size
+    in them, and what the model lacks may favour either. A dead zone of the input does nearly the same.
+    """
+    if _plausibility(rival)[0] or not _plausibility(winner)[0] or not is_poor(winner, noise):
+        return False
+    if winner.free_run is None or rival.free_run is None:
+        return False
+    if free_runs_apart(winner, rival) or _free_run_certainty(winner, rival) > SEPARATE_Z:
+        return False
+    return _prediction_gain(rival, current) > FRICTION_SHARE * _prediction_gain(winner, current) > 0
+
+
+def _prediction_gain(a: ValidatedHypothesis, b: ValidatedHypothesis) -> float:
+    """Gain in predictions of validation and training data together [nat]."""
+    return paired_gain(a.blocks, b.blocks)[0] + _training_gain(a, b)[0]
 
 
 def _plausibility(t: ValidatedHypothesis) -> tuple[bool, int]:
@@ -433,10 +465,7 @@ def _alike(
         return True
     if free_runs_apart(winner, rival) or not is_poor(winner, noise):
         return False
-    gains = [
-        paired_gain(t.blocks, current.blocks)[0] + _training_gain(t, current)[0] for t in (winner, rival)
-    ]
-    return gains[1] > (1 - GAIN_APART) * gains[0] > 0
+    return _prediction_gain(rival, current) > (1 - GAIN_APART) * _prediction_gain(winner, current) > 0
 
 
 def _related(a: ValidatedHypothesis, b: ValidatedHypothesis) -> bool:
