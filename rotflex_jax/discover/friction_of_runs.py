@@ -13,11 +13,15 @@ from jaxtyping import Float
 
 from rotflex_jax.discover.hypothesis import CandidateStart, Hypothesis, is_physical, with_own_friction
 from rotflex_jax.discover.likelihood import refit
-from rotflex_jax.discover.selection import FREE_RUN_BETTER, FREE_RUN_Z, SUPPORT_Z, paired_gain
+from rotflex_jax.discover.selection import FREE_RUN_BETTER, FREE_RUN_Z, SUPPORT_Z, is_poor, paired_gain
 from rotflex_jax.discover.stepwise import refit_from_contained
-from rotflex_jax.discover.supermodel import EffectLocation
+from rotflex_jax.discover.supermodel import EffectLocation, SuperModel
 from rotflex_jax.discover.validation import Horizons, ValidatedHypothesis, ValidationSet
 from rotflex_jax.effects.base import DRY_FRICTION
+
+# In a poor model, friction of a validation run has a size of its own only if it differs by more than this
+# factor. What else the model lacks may make free runs better with a slightly larger or smaller friction.
+LARGE_DIFFERENCE = 1.75
 
 
 class Refits(NamedTuple):
@@ -67,8 +71,9 @@ def validated_with_own_friction(
 ) -> ValidatedHypothesis:
     """A model of one training recording, with friction of its own size in validation runs of other runs.
 
-    It is the given model unless free runs over each of these validation recordings are clearly better so.
-    Several training recordings show by themselves whether friction differs (`refit_with_own_friction`).
+    It is the given model unless free runs over each of these validation recordings are clearly better so. In
+    a model that is still poor then, friction must differ by a large factor too. Several training recordings
+    show by themselves whether friction differs (`refit_with_own_friction`).
 
     Args:
         horizons: Training and validation recordings at both horizons.
@@ -87,10 +92,27 @@ def validated_with_own_friction(
     tried = horizons.validated(own[0], own[1], near)
     assert tried.free_run
     counts = validation.problem.block_counts
-    physical = all(is_physical(s, v.adapted, found.location) for v in (tried, tried.free_run))
-    if not (physical and _better_in_each(tried.free_run.blocks, found.free_run.blocks, counts, unknown)):
+    if (
+        not all(is_physical(s, v.adapted, found.location) for v in (tried, tried.free_run))
+        or not _better_in_each(tried.free_run.blocks, found.free_run.blocks, counts, unknown)
+        or (is_poor(tried, validation.problem.noise) and not _differs_much(s, tried.free_run, unknown))
+    ):
         return found
     return dataclasses.replace(tried, location=found.location, parameter_count=found.parameter_count)
+
+
+def _differs_much(s: SuperModel, tried: ValidatedHypothesis, unknown: Sequence[int]) -> bool:
+    """Whether friction in each validation recording differs by `LARGE_DIFFERENCE` from that of training.
+
+    Args:
+        s: The model with all candidates.
+        tried: The model with sizes of friction that were fitted to validation recordings.
+        unknown: Indices of these recordings.
+    """
+    sizes = list(tried.hypothesis.sizes)
+    trained = float(np.abs(tried.hypothesis.mean_values(s)[sizes]).max())
+    each = np.abs(tried.adapted.values(s)[unknown][:, sizes]).max(axis=1)
+    return bool(np.all(np.maximum(each, trained) > LARGE_DIFFERENCE * np.minimum(each, trained)))
 
 
 def validated_baseline(
