@@ -114,6 +114,14 @@ def measured(machine: str, direction: str, methods: list[str], warm: bool) -> di
     return row
 
 
+def with_comparison(row: dict[str, Any], before: dict[str, Any]) -> dict[str, Any]:
+    """A row that lacks other methods, with those of an earlier row and the commit of that row."""
+    others = before.get("others")
+    if "error" in row or row["others"] or not others:
+        return row
+    return row | {"others": {"commit": before["commit"], **others}}
+
+
 def arguments() -> argparse.Namespace:
     """Command line."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
@@ -122,7 +130,10 @@ def arguments() -> argparse.Namespace:
     )
     parser.add_argument("--list", action="store_true", help="Name all directions and end.")
     parser.add_argument(
-        "--methods", nargs="*", default=None, help="of the comparison; the quick ones if omitted"
+        "--methods",
+        nargs="*",
+        default=None,
+        help="of the comparison; the quick ones if omitted; those of the earlier row if none is named",
     )
     parser.add_argument("--workers", type=int, default=1, help="directions at the same time")
     parser.add_argument("--cold-only", action="store_true", help="No second search of each direction.")
@@ -158,7 +169,9 @@ def main() -> int:
     for count, (machine, direction, row) in enumerate(done, 1):
         key = f"{machine}: {direction}"
         head = {"machine": machine, "direction": direction}
-        rows[key] = head | row | {k: made[k] for k in ("commit", "clean", "code")}
+        rows[key] = (
+            head | with_comparison(row, rows.get(key, {})) | {k: made[k] for k in ("commit", "clean", "code")}
+        )
         results["left_out"].pop(machine, None)
         save(a.out, results)
         write_file(a.out.with_suffix(".md"), page(results))

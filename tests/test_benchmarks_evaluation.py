@@ -8,6 +8,7 @@ import pytest
 
 import evaluation
 import rotflex_jax as rf
+from B9_measured import with_comparison
 from measured_machines.page import best, evaluated as errors_of, held_out, page
 from rotflex_jax.arena.measured import MACHINES, halves
 from rotflex_jax.arena.simulator.records import make_record
@@ -137,3 +138,15 @@ def test_page_takes_what_the_search_reports_and_says_so():
     text = page({"rows": {"rotflex: A to B": row}})
     changes = "lugre@hub for dahl@hub, without voltage_offset@input, hub.lugre.level separate for each run"
     assert f"|  |  |  | fitted to all, {changes} | {three} | {three} | {three} |" in text
+
+
+def test_a_search_that_is_run_again_keeps_the_comparison_with_its_commit():
+    before = {"commit": "a1", "others": {"seconds": 1.0, "rows": []}}
+    again = with_comparison({"sentence": "", "others": None}, before)
+    assert again["others"] == {"commit": "a1", "seconds": 1.0, "rows": []}
+    # A third run names the commit of the comparison, not that of the second.
+    assert with_comparison({"others": None}, again | {"commit": "b2"})["others"] == again["others"]
+    compared = {"others": {"seconds": 2.0, "rows": []}}
+    assert with_comparison(compared, before) == compared
+    assert with_comparison({"error": "stopped"}, before) == {"error": "stopped"}
+    assert with_comparison({"others": None}, {}) == {"others": None}

@@ -173,6 +173,7 @@ KNOWN = {
     "method.md": {
         **dict.fromkeys(["1.5", "0.03"], "numbers of the decision, compared in test_docs.py"),
         "2.5": "selection.FREE_RUN_Z",
+        "1.75": "friction_of_runs.LARGE_DIFFERENCE",
         "13.4": "section of a book",
     },
     "read_report.md": {"1.5": "result.NEAR_FLOOR"},
@@ -186,6 +187,7 @@ KNOWN = {
         "-3.16": "published [N]",
         **dict.fromkeys(["5.7", "9.2"], "supply of a measured servo [V], as its files have it"),
         **dict.fromkeys(["0.85", "0.80"], "errors of B9 before something that was tried"),
+        **dict.fromkeys(["0.28", "0.36"], "errors of B after fits by hand to A"),
         **dict.fromkeys(["0.94", "0.48", "0.15", "0.84"], "errors of earlier searches on two processors"),
         **dict.fromkeys(
             [

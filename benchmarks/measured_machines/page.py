@@ -124,7 +124,9 @@ def page(results: dict[str, Any]) -> str:
             label = stage + differences_from_found(row) if stage in last else stage
             lines.append("| " + " | ".join([*head, label, *cells, source]) + " |")
         name, whole, windows = best(row)
-        cells = [told(whole, machine.factor), told(windows, machine.factor), "", "", "", "`compare`"]
+        commit = (row["others"] or {}).get("commit")  # of an earlier row
+        source = f"`compare` ({commit})" if commit else "`compare`"
+        cells = [told(whole, machine.factor), told(windows, machine.factor), "", "", "", source]
         lines.append("| " + " | ".join(["", "", "", f"best other: {name}", *cells]) + " |")
     lines += [
         "",
