@@ -286,7 +286,7 @@ def _friction_comes_first(
     In a poor model predictions do not decide between the two. Friction that differs between runs has one size
     in them, and what the model lacks may favour either. A dead zone of the input does nearly the same.
     """
-    if _plausibility(rival)[0] or not _plausibility(winner)[0] or not is_poor(winner, noise):
+    if not _is_dry_friction(rival) or _is_dry_friction(winner) or not is_poor(winner, noise):
         return False
     if winner.free_run is None or rival.free_run is None:
         return False
@@ -302,8 +302,13 @@ def _prediction_gain(a: ValidatedHypothesis, b: ValidatedHypothesis) -> float:
 
 def _plausibility(t: ValidatedHypothesis) -> tuple[bool, int]:
     """Sort key of effects that data do not distinguish: dry friction first, then fewer parameters."""
+    return not _is_dry_friction(t), t.parameter_count
+
+
+def _is_dry_friction(t: ValidatedHypothesis) -> bool:
+    """Whether the effect of a candidate is a law of dry friction."""
     assert t.location
-    return law_of(t.location.effect) != DRY_FRICTION, t.parameter_count
+    return law_of(t.location.effect) == DRY_FRICTION
 
 
 def undecided(found: ValidatedHypothesis, rival: ValidatedHypothesis, left: float, measured: float) -> bool:
