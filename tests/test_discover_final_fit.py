@@ -101,7 +101,8 @@ def test_its_errors_are_those_of_its_model(found, runs):
     assert last.test.windows["theta"] == pytest.approx(short_runs_miss(last.model, test), rel=1e-6)
     whole = rf.metrics.rmse(test, last.model.simulate(test))["theta"]
     assert last.test.whole["theta"] == pytest.approx(whole, rel=1e-6)
-    # `rf.fit` gives the same; fitted to training data alone, it gives the errors `trained`.
+    # `rf.fit` gives the same; fitted to training data alone, it gives the errors `trained`. Friction of the
+    # validation run differs by half, too little to have a size of its own in a model that leaves errors.
     structure, local = found.final.model.mechanism, list(last.fit.local)
     if OFFSET in local:
         structure = structure + rf.effects.VoltageOffset("input")
@@ -109,10 +110,6 @@ def test_its_errors_are_those_of_its_model(found, runs):
     both = rf.fit(structure, [train, validation], local=local, **how).model
     assert level_of(both) == pytest.approx(level_of(found.model), rel=0.02)
     alone = rf.fit(structure, train, local=[n for n in local if n == OFFSET], **how).model
-    # The friction of the validation run is its own: it is fitted to this run, and nothing else is.
-    held = [n for n in alone.mechanism.free_names if n not in (LEVEL, OFFSET)]
-    alone = dataclasses.replace(alone, mechanism=alone.mechanism.trust(*held))
-    alone = rf.fit(alone, validation, local=[n for n in local if n == OFFSET], **how).model
     assert last.trained.windows["theta"] == pytest.approx(short_runs_miss(alone, validation), rel=0.2)
 
 
