@@ -419,6 +419,7 @@ def adapted_to_recordings(
     own = [coordinates.of_recording(r) for r in range(len(h.x0))]
     sizes = [h.local.index(i) for i in h.sizes]
     offsets = [k for k in range(len(h.local)) if k not in sizes]
+    with_friction = problem.of_other_runs if friction else []
 
     def joined(points: list[_OwnStep]) -> Hypothesis:
         step = np.zeros(coordinates.size)
@@ -440,7 +441,7 @@ def adapted_to_recordings(
             gradient, curvature = g[row], H[np.ix_(row, row)]
             gradient[offsets] += weight[r] * here.local_z[r, offsets]
             curvature[offsets, offsets] += weight[r]
-            if not (friction and r in problem.of_other_runs):
+            if r not in with_friction:
                 gradient[sizes], curvature[sizes], curvature[:, sizes] = 0.0, 0.0, 0.0
                 curvature[sizes, sizes] = 1.0
             cost = 0.5 * float(np.sum(w[r] ** 2) + weight[r] * np.sum(here.local_z[r, offsets] ** 2))
