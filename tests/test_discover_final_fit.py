@@ -113,6 +113,25 @@ def test_its_errors_are_those_of_its_model(found, runs):
     assert last.trained.windows["theta"] == pytest.approx(short_runs_miss(alone, validation), rel=0.2)
 
 
+def test_its_errors_without_validation_data_are_with_the_friction_of_their_run(arm):
+    """Friction of the validation run is nearly twice that of training, and falls with the speed in both.
+
+    The errors `trained` are those of a fit to training data, with a level that `rf.fit` finds in the validation
+    run while all else is held. A constant friction leaves errors, so the model has a final fit.
+    """
+    train, validation = run(0.05, 0.0, 0, excess=0.03), run(0.11, 0.0, 1, excess=0.03)
+    found = rf.discover(arm, train, validation, candidates=CANDIDATES, rounds=1, calibrate_seconds=0.0)
+    assert found.verdict == "unexplained" and LEVEL in found.final.friction_of_validation
+    how = {"first": "measured", "window_seconds": 2.0}
+    alone = rf.fit(found.final.model.mechanism, train, **how).model
+    held = alone.mechanism.trust(*(n for n in alone.mechanism.parameter_names if n != LEVEL))
+    own = rf.fit(held, validation, **how).model
+    assert level_of(own) > 1.5 * level_of(alone)
+    assert short_runs_miss(own, validation) < 0.2 * short_runs_miss(alone, validation)
+    trained = found.final_fit.trained.windows["theta"]
+    assert trained == pytest.approx(short_runs_miss(own, validation), rel=0.1)
+
+
 def test_offsets_stay_with_their_runs(arm, monkeypatch):
     """Another run gets no offset; a later part of a fitted run gets the offset of this run."""
     monkeypatch.setattr(MODULE, "MOST_WORSE", np.inf)
