@@ -116,8 +116,8 @@ def test_its_errors_are_those_of_its_model(found, runs):
 def test_its_errors_without_validation_data_are_with_the_friction_of_their_run(arm):
     """Friction of the validation run is nearly twice that of training, and falls with the speed in both.
 
-    The errors `trained` are those of a fit to training data, with a level that `rf.fit` finds in the validation
-    run while all else is held. A constant friction leaves errors, so the model has a final fit.
+    The errors `trained` are those of a fit to training data, with a level that `rf.fit` finds in the
+    validation run while all else is held. A constant friction leaves errors, so the model has a final fit.
     """
     train, validation = run(0.05, 0.0, 0, excess=0.03), run(0.11, 0.0, 1, excess=0.03)
     found = rf.discover(arm, train, validation, candidates=CANDIDATES, rounds=1, calibrate_seconds=0.0)

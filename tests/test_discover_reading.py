@@ -3,12 +3,14 @@
 import dataclasses
 import re
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
 
 import rotflex_jax as rf
 from rotflex_jax.arena.simulator.records import make_record
+from rotflex_jax.discover import forward_selection
 from rotflex_jax.discover.reading import held_equivalent, sign_note
 from rotflex_jax.effects import Coulomb, LuGre, Stribeck
 
@@ -103,15 +105,25 @@ def test_all_channels_with_the_opposite_sign_are_an_input_with_it() -> None:
     assert "leave 11.5 deg of it, and 5.73 deg where it is negated. If so, negate the input" in note
 
 
-def test_validation_data_at_rest_are_named() -> None:
+def test_validation_data_at_rest_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
     """The voltage is zero in the validation part, in which friction holds the hub at rest."""
+    choose, told = forward_selection.choose, []
+
+    def choose_as_told(*arguments: Any) -> Any:
+        told.append(arguments[-1])
+        return choose(*arguments)
+
+    monkeypatch.setattr(forward_selection, "choose", choose_as_told)
     t = np.arange(round(10 * FAST)) / FAST
     played = np.where(t < 6.0, 2 * multisine(t), 0.0)
     r = make_record({("coulomb", "hub"): {"level": 0.03}}, seed=5, fs=FAST, played=played)
     run = rf.Recording(u=r["u"], y=r["y"], Ts=1 / FAST)
     train, still = run.slice(0, 4000), run.slice(8000, 10000)
-    found = rf.discover(rf.joints.paper(), train, still, candidates=FRICTIONS, rounds=0)
+    found = rf.discover(rf.joints.paper(), train, still, candidates=FRICTIONS, rounds=1)
     theta, alpha = (note for note in found.notes if "hardly moves" in note)
+    assert told == [True]  # the rule that chooses an effect knows of it
+    rf.discover(rf.joints.paper(), *train.split(0.7), candidates=FRICTIONS, rounds=1)
+    assert told == [True, False]
     windows = [run.y[k : k + 2000] for k in (8000, 0, 2000)]
     rests, *both = (np.rad2deg(y.std(axis=0)) for y in windows)
     moves = np.sqrt(np.mean(np.square(both), axis=0))

@@ -509,6 +509,27 @@ def test_free_runs_alone_are_two_and_a_half_deviations_sure(side: float, which: 
 
 
 @SIDES
+def test_where_validation_data_rest_training_data_decide_on_dry_friction(side: float) -> None:
+    """Free runs of training data must be five deviations sure, those of validation data need only agree."""
+
+    def passes(found: ValidatedHypothesis, still: bool = True) -> bool:
+        return admissible(found, FAR, MEASURED, NOISE, still)
+
+    unsure = of_free_runs(z=0.5, train_z=5.0 * side)
+    assert passes(unsure) is (side > 1) and not passes(unsure, still=False)
+    assert passes(of_free_runs(windows=10.0 * np.exp(-0.1 * side), z=0.5)) is (side > 1)
+    opposed = of_free_runs(z=0.5)
+    blocks = opposed.free_run.blocks - (50.0 + side - 1.0) / BLOCKS
+    opposed = dataclasses.replace(opposed, free_run=dataclasses.replace(opposed.free_run, blocks=blocks))
+    assert passes(opposed) is (side < 1)
+    # Not every machine has another effect, and near the noise predictions decide.
+    drag = dataclasses.replace(of_free_runs(z=0.5), location=DRAG)
+    assert not passes(drag)
+    near = at_both({"windows": 1.1}, {"windows": 1.1})
+    assert not admissible(of_free_runs(windows=0.9, z=0.5), near, MEASURED, NOISE, True)
+
+
+@SIDES
 def test_free_runs_alone_fall_by_a_tenth(side: float) -> None:
     assert admissible(of_free_runs(windows=10.0 * np.exp(-0.1 * side)), FAR, MEASURED, NOISE) is (side > 1)
 

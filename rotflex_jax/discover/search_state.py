@@ -86,6 +86,7 @@ class SearchState:
         nominal: The user's model with its given values; None unless the fit has moved far away from them.
         resumed: Number of rounds of a stopped search after which this search continued.
         reading_notes: Notes that recordings may have been read wrongly, or cannot decide.
+        still: Whether a channel hardly moves in the validation data.
         digest: Digest of everything that the models depend on.
     """
 
@@ -96,6 +97,7 @@ class SearchState:
     digest: str = ""
     resumed: int = 0
     reading_notes: tuple[str, ...] = ()
+    still: bool = False
     ranking: list[tuple[Score, float]] = dataclasses.field(default_factory=list)
     scores: dict[EffectLocation, float] = dataclasses.field(default_factory=dict)
     rivals: dict[EffectLocation, list[EffectLocation]] = dataclasses.field(default_factory=dict)
@@ -309,9 +311,9 @@ def _check_baseline(state: SearchState) -> None:
         problem, seconds = state.horizons.free_run.problem, state.validation.window_seconds
         signs = opposite_signs(state.model, problem, runs.hypothesis, seconds)
         notes += sign_note(signs, state.units, seconds)
-    notes += _still_channels(state)
-    state.reading_notes = notes
-    for line in notes:
+    still = _still_channels(state)
+    state.still, state.reading_notes = bool(still), notes + still
+    for line in state.reading_notes:
         state.say(line)
     if any(far_from_given(state.problem.supermodel, h) for h in state.fits):
         state.nominal = as_given(state.horizons)

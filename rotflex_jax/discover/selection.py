@@ -59,6 +59,9 @@ SUPPORT_Z, OBJECTION_Z = 1.5, 1.5
 # An effect that predictions prefer by this many standard deviations, on validation and on training data, need
 # not improve free runs that are dominated by another error, if it does not make them worse.
 PREDICTION_Z = 3.5
+# Where a channel hardly moves in the validation data, dry friction must be preferred by free runs of training
+# data by this many standard deviations of the block gains; those of validation data need only agree.
+RESTING_TRAIN_Z = 5.0
 # Free runs of a poor model exclude a rival whose errors are larger by this (mean log ratio). If the
 # difference between the runs is independent of the errors that are left, it is then as large as they are.
 LAWS_APART = 0.5 * float(np.log(2.0))
@@ -149,6 +152,7 @@ def admissible(
     current: ValidatedHypothesis,
     measured: float,
     noise: Float[np.ndarray, " C"],
+    still: bool = False,
 ) -> bool:
     """Whether a candidate passes the tests of one round on training and validation data.
 
@@ -157,6 +161,7 @@ def admissible(
         current: The hypothesis without it.
         measured: Number of measured values in the training recordings.
         noise: Standard deviation of the sensor noise of each channel.
+        still: Whether a channel hardly moves in the validation data.
     """
     nats, z = paired_gain(candidate.blocks, current.blocks)
     train, train_z = _training_gain(candidate, current)
@@ -175,7 +180,11 @@ def admissible(
     if enough and min(ratio, as_trained) < limit:
         beyond_doubt = min(z, train_z) > PREDICTION_Z
         return not far or certainty > HELD_OUT_Z or as_trained < -FREE_RUN_BETTER or beyond_doubt
-    return far and _free_runs_prefer(candidate, current, FREE_RUN_Z)
+    if not far:
+        return False
+    if still and _is_dry_friction(candidate) and _training_runs_prefer(candidate, current):
+        return True
+    return _free_runs_prefer(candidate, current, FREE_RUN_Z)
 
 
 def is_poor(t: ValidatedHypothesis, noise: Float[np.ndarray, " C"]) -> bool:
@@ -231,6 +240,7 @@ def choose(
     current: ValidatedHypothesis,
     measured: float,
     noise: Float[np.ndarray, " C"],
+    still: bool = False,
 ) -> tuple[ValidatedHypothesis | None, list[ValidatedHypothesis]]:
     """The best admissible candidate, and the candidates that are not distinguished from it.
 
@@ -239,7 +249,7 @@ def choose(
     effect is small, chance decides which of the two passes. It is enough that the rival gains something and
     that nothing distinguishes it from the winner. Arguments are as in `admissible`.
     """
-    able = [t for t in candidates if admissible(t, current, measured, noise)]
+    able = [t for t in candidates if admissible(t, current, measured, noise, still)]
     if not able:
         return None, []
     shares = {t.location: share for t, share in zip(able, shares_of_gain(able, current), strict=True)}
@@ -548,6 +558,19 @@ def _free_runs_prefer(candidate: ValidatedHypothesis, current: ValidatedHypothes
     if runs is None or before is None or _log_error_ratio(runs, before) > -FREE_RUN_BETTER:
         return False
     return _free_run_certainty(candidate, current) > least
+
+
+def _training_runs_prefer(candidate: ValidatedHypothesis, current: ValidatedHypothesis) -> bool:
+    """Whether free runs of training data clearly prefer a candidate, and those of validation data agree.
+
+    Where the machine rests, friction that holds it and a model that is too heavy to move do the same, so
+    validation data at rest cannot be certain of either.
+    """
+    runs, before = candidate.free_run, current.free_run
+    if runs is None or before is None or _training_gain(runs, before)[1] < RESTING_TRAIN_Z:
+        return False
+    better = paired_gain(runs.blocks, before.blocks)[0] > 0
+    return better and _log_error_ratio(runs, before) < -FREE_RUN_BETTER
 
 
 def _free_run_certainty(a: ValidatedHypothesis, b: ValidatedHypothesis) -> float:
