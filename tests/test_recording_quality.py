@@ -247,6 +247,19 @@ def test_ten_samples_at_an_end_in_two_visits(at_end: tuple[int, ...], found: boo
     assert not found or cut_off(x, None, x, 0.01) == (1.0, 10)
 
 
+@pytest.mark.parametrize(("order", "found"), [(1, True), (2, False), (3, False)])
+def test_an_end_that_is_crept_to_after_a_pause_is_no_limit(order: int, found: bool) -> None:
+    """A joint with dry friction follows a step of its setpoint, pauses, creeps on, and leaves at the next.
+
+    The last tenth takes 3.1 times as long as the last fortieth, where the distance to the end falls as
+    (1 - t)^order. The signal goes straight on only where the order is one.
+    """
+    t = np.linspace(0.0, 1.0, 110, endpoint=False)
+    arrives = [np.linspace(1.0, 0.1, 200, endpoint=False), np.linspace(0.1, 0.025, 230, endpoint=False)]
+    one = np.concatenate([*arrives, 0.025 * (1 - t) ** order, np.zeros(180), np.linspace(0.0, 1.0, 400)])
+    assert is_cut(1.0 - np.tile(one, 2)) == found
+
+
 @pytest.mark.parametrize(("more", "found"), [(0, False), (1, True)])
 def test_twelve_samples_on_the_way_are_enough(more: int, found: bool) -> None:
     """Within a tenth of the end, arriving and leaving, there are 11 or 12 samples per visit.

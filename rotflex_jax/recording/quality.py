@@ -93,7 +93,9 @@ def _passes_straight(z: Float[np.ndarray, " N"], there: Bool[np.ndarray, " N"], 
 
     A motion that stops or turns follows a parabola: over the last distance D it needs twice the time that it
     needs over the last D / 4. A signal that is cut off goes straight on, and needs four times as long. The
-    ratio of these times, over all visits together, must be above 2.5 for arriving and for leaving.
+    ratio of these times, over all visits together, must be above 2.5 for arriving and for leaving. A signal
+    that pauses before it creeps to its end may have such a ratio by chance. So the same must hold for D / 4
+    and D / 16, if the signal takes enough samples there.
     """
     far = max(40 * step, 0.1 * z.max())
     visits = 0
@@ -103,7 +105,10 @@ def _passes_straight(z: Float[np.ndarray, " N"], there: Bool[np.ndarray, " N"], 
         if np.sum(far_times) >= 12 * visits:
             break
         far *= 2  # too few samples: half a sample at each end would matter
-    return visits >= 2 and bool(np.all(far_times > 2.5 * near_times))
+    if visits < 2 or not np.all(far_times > 2.5 * near_times):
+        return False
+    visits, near_times, far_times = _passing_times(z, there, step, far / 4)
+    return bool(np.sum(far_times) < 12 * visits or np.all(far_times >= 2.5 * near_times))
 
 
 def _passing_times(
