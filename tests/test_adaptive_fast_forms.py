@@ -145,7 +145,7 @@ def test_identify_is_a_run_from_the_first_scored_sample() -> None:
     np.testing.assert_allclose(found.run.errors, plain.errors, atol=1e-14)
 
 
-def test_other_numbers_compile_nothing_anew() -> None:
+def test_other_values_compile_nothing_again() -> None:
     u, y = record()
     basis = Volterra(Delays(9))
     run(LMS(1e-4), u, y, basis=basis)

@@ -248,7 +248,7 @@ def test_a_pole_is_found_through_the_filter() -> None:
     assert found.value == pytest.approx(0.05**2 / np.var(y), rel=0.15)
 
 
-def test_other_numbers_compile_nothing_anew(short: list[Recording]) -> None:
+def test_other_values_compile_nothing_again(short: list[Recording]) -> None:
     traces = []
 
     def build(settings: dict) -> LMS:

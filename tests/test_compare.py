@@ -119,7 +119,7 @@ def test_errors_are_those_of_the_metrics_on_the_same_free_run(table: Comparison)
     assert row.worst == pytest.approx(rf.metrics.max_error(test, row.simulated[0]))
 
 
-def test_windows_start_anew() -> None:
+def test_windows_start_again() -> None:
     """Errors over windows are those of free runs that start again in each window."""
     table = rf.compare(recorded(7.0), ["textbook"], window_seconds=1.0)
     (test,), row = table.test, table["textbook"]

@@ -177,7 +177,7 @@ def test_another_length_makes_no_more() -> None:
     assert others == 0
 
 
-def test_other_numbers_make_no_more() -> None:
+def test_other_values_make_no_more() -> None:
     """Another recording of the same length needs no further program, or those of one more fit."""
     searched(2010)
     others, found = made_by(lambda: searched(2011))

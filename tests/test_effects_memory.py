@@ -419,7 +419,7 @@ NEW += [fx.Delay(time=0.0051), fx.Lag(time=0.006), fx.SensorCubic("alpha", 6.0),
 
 
 @pytest.mark.parametrize("effect", NEW, ids=lambda e: e.name)
-def test_off_it_is_absent_and_other_numbers_need_no_new_program(effect):
+def test_off_it_is_absent_and_other_values_need_no_new_program(effect):
     joint, u = paper() + effect, voltage()
     bare, on = simulate(paper(), u, Ts), simulate(joint, u, Ts)
     programs = len(_free_outputs)

@@ -208,7 +208,7 @@ def test_each_recording_has_an_offset_of_its_own():
         assert alone[name].value == pytest.approx(v, abs=4 * alone[name].std)
 
 
-def test_windows_begin_anew_but_a_recording_keeps_its_own_offset():
+def test_windows_start_again_but_a_recording_keeps_its_own_offset():
     """A fit to thirds of two recordings finds one offset for each recording, not one for each third."""
     pairs = [
         make_record({("voltage_offset", "input"): {"offset": v}}, seed=6, seconds=1.5, fs=400.0)

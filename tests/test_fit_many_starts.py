@@ -102,7 +102,7 @@ def test_those_that_went_to_the_end_agree_and_are_in_order(found) -> None:
     assert any("first seconds: 8 done" in line for line in said)
 
 
-def test_other_numbers_compile_nothing_anew(found) -> None:
+def test_other_values_compile_nothing_again(found) -> None:
     recordings, _, _ = found
     before = len(minimise_starts)
     other = paper(hub_inertia=0.0025, stiffness=1.9, hub_damping=0.004, joint_damping=0.001)

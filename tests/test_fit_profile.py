@@ -163,7 +163,7 @@ def test_a_profile_is_shown_and_written():
     assert "deg" in open_below._repr_html_()
 
 
-def test_nuisances_are_fitted_anew():
+def test_nuisances_are_fitted_again():
     """Along the profile of the torque constant, the damping follows the slope of their covariance."""
     m = axis(CONSTANT) + rf.effects.Viscous("hub", coefficient=0.02)
     y = rf.simulate(m, recording().u, TS) + 0.01 * np.random.default_rng(3).normal(size=(N, 1))

@@ -74,7 +74,7 @@ def test_a_moved_number_is_that_of_the_model(explorer: Explorer, recording: rf.R
     assert explorer.errors == pytest.approx(explorer.given) and explorer.factor.value == 1.0
 
 
-def test_nothing_is_compiled_anew(explorer: Explorer) -> None:
+def test_nothing_is_compiled_again(explorer: Explorer) -> None:
     explorer.switches[SPRING].value = True
     compiled = len(_free_many)
     explorer.switches[FRICTION].value = False
