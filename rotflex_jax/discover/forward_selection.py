@@ -196,13 +196,13 @@ def add_best(state: SearchState, promising: Sequence[Promising]) -> bool:
     measured, current = state.problem.measured_values, state.current
     for candidate in candidates:
         state.say("  " + describe(candidate, current))
-    winner, rivals = choose(candidates, current, measured, state.problem.noise, state.still)
+    winner, rivals = choose(candidates, current, measured, state.problem.noise, bool(state.still))
     if winner is None or winner.location is None:
         return False
     if more := _refit_replaced(state, winner, [c.location for c in candidates if c.location]):
         scored = [*scored, *(s for s, _ in more)]
         candidates = [*candidates, *(c for _, c in more)]
-        winner, rivals = choose(candidates, current, measured, state.problem.noise, state.still)
+        winner, rivals = choose(candidates, current, measured, state.problem.noise, bool(state.still))
         assert winner and winner.location
     nats = max((s.nats for s in scored if s.location == winner.location), default=0.0)
     not_distinguished = tuple(r.location for r in rivals if r.location)

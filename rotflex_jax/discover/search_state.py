@@ -86,7 +86,6 @@ class SearchState:
         nominal: The user's model with its given values; None unless the fit has moved far away from them.
         resumed: Number of rounds of a stopped search after which this search continued.
         reading_notes: Notes that recordings may have been read wrongly, or cannot decide.
-        still: Whether a channel hardly moves in the validation data.
         digest: Digest of everything that the models depend on.
     """
 
@@ -97,7 +96,6 @@ class SearchState:
     digest: str = ""
     resumed: int = 0
     reading_notes: tuple[str, ...] = ()
-    still: bool = False
     ranking: list[tuple[Score, float]] = dataclasses.field(default_factory=list)
     scores: dict[EffectLocation, float] = dataclasses.field(default_factory=dict)
     rivals: dict[EffectLocation, list[EffectLocation]] = dataclasses.field(default_factory=dict)
@@ -176,6 +174,14 @@ class SearchState:
     def validation(self) -> ValidationSet:
         """Predictions of the validation recordings."""
         return self.horizons.prediction.validation
+
+    @functools.cached_property
+    def still(self) -> dict[str, tuple[float, float]]:
+        """Channels that hardly move in the validation data; see `still_channels`."""
+        at = self.horizons.free_run
+        if at.validation.folds:  # the validation recordings are those of training
+            return {}
+        return still_channels(at.problem, at.validation.problem)
 
     @property
     def noise_floor(self) -> dict[str, float]:
@@ -311,21 +317,12 @@ def _check_baseline(state: SearchState) -> None:
         problem, seconds = state.horizons.free_run.problem, state.validation.window_seconds
         signs = opposite_signs(state.model, problem, runs.hypothesis, seconds)
         notes += sign_note(signs, state.units, seconds)
-    still = _still_channels(state)
-    state.still, state.reading_notes = bool(still), notes + still
-    for line in state.reading_notes:
+    notes += still_note(state.still, state.units, state.validation.window_seconds)
+    state.reading_notes = notes
+    for line in notes:
         state.say(line)
     if any(far_from_given(state.problem.supermodel, h) for h in state.fits):
         state.nominal = as_given(state.horizons)
-
-
-def _still_channels(state: SearchState) -> tuple[str, ...]:
-    """A sentence on each channel that hardly moves in the validation data."""
-    at = state.horizons.free_run
-    if at.validation.folds:  # the validation recordings are those of training
-        return ()
-    found = still_channels(at.problem, at.validation.problem)
-    return still_note(found, state.units, at.validation.window_seconds)
 
 
 def as_it_was(model: Model, horizons: Horizons, say: Progress, digest: str, path: str | Path) -> SearchState:

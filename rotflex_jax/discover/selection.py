@@ -180,11 +180,12 @@ def admissible(
     if enough and min(ratio, as_trained) < limit:
         beyond_doubt = min(z, train_z) > PREDICTION_Z
         return not far or certainty > HELD_OUT_Z or as_trained < -FREE_RUN_BETTER or beyond_doubt
-    if not far:
-        return False
-    if still and _is_dry_friction(candidate) and _training_runs_prefer(candidate, current):
-        return True
-    return _free_runs_prefer(candidate, current, FREE_RUN_Z)
+    # Where the machine rests, friction that holds it and a model that is too heavy to move do the same, so
+    # validation data at rest cannot be certain of either: they need only agree with training data.
+    training_decides = still and _is_dry_friction(candidate)
+    if training_decides and _training_gain(runs, before)[1] >= RESTING_TRAIN_Z:
+        return far and _free_runs_prefer(candidate, current, 0.0)
+    return far and _free_runs_prefer(candidate, current, FREE_RUN_Z)
 
 
 def is_poor(t: ValidatedHypothesis, noise: Float[np.ndarray, " C"]) -> bool:
@@ -558,19 +559,6 @@ def _free_runs_prefer(candidate: ValidatedHypothesis, current: ValidatedHypothes
     if runs is None or before is None or _log_error_ratio(runs, before) > -FREE_RUN_BETTER:
         return False
     return _free_run_certainty(candidate, current) > least
-
-
-def _training_runs_prefer(candidate: ValidatedHypothesis, current: ValidatedHypothesis) -> bool:
-    """Whether free runs of training data clearly prefer a candidate, and those of validation data agree.
-
-    Where the machine rests, friction that holds it and a model that is too heavy to move do the same, so
-    validation data at rest cannot be certain of either.
-    """
-    runs, before = candidate.free_run, current.free_run
-    if runs is None or before is None or _training_gain(runs, before)[1] < RESTING_TRAIN_Z:
-        return False
-    better = paired_gain(runs.blocks, before.blocks)[0] > 0
-    return better and _log_error_ratio(runs, before) < -FREE_RUN_BETTER
 
 
 def _free_run_certainty(a: ValidatedHypothesis, b: ValidatedHypothesis) -> float:

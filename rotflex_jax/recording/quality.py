@@ -11,6 +11,7 @@ deflection is as large as theta at no more than one frequency; an octave above, 
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Complex, Float
@@ -97,24 +98,46 @@ def _passes_straight(z: Float[np.ndarray, " N"], there: Bool[np.ndarray, " N"], 
     that pauses before it creeps to its end may have such a ratio by chance. So the same must hold for D / 4
     and D / 16, if the signal takes enough samples there.
     """
-    far = max(40 * step, 0.1 * z.max())
-    visits = 0
-    near_times = far_times = np.zeros(2)
+    far, passing = max(40 * step, 0.1 * z.max()), _Passing(0, np.zeros(2), np.zeros(2))
     while far <= 0.5 * z.max():  # a motion of a few steps is no evidence
-        visits, near_times, far_times = _passing_times(z, there, step, far)
-        if np.sum(far_times) >= 12 * visits:
+        passing = _passing_times(z, there, step, far)
+        if passing.lasts:
             break
         far *= 2  # too few samples: half a sample at each end would matter
-    if visits < 2 or not np.all(far_times > 2.5 * near_times):
+    if passing.visits < 2 or not passing.straight:
         return False
-    visits, near_times, far_times = _passing_times(z, there, step, far / 4)
-    return bool(np.sum(far_times) < 12 * visits or np.all(far_times >= 2.5 * near_times))
+    closer = _passing_times(z, there, step, far / 4)
+    return not closer.visits or not closer.lasts or closer.straight
+
+
+class _Passing(NamedTuple):
+    """How a signal arrives at an end and leaves it.
+
+    Attributes:
+        visits: Number of visits to the end.
+        near: Times [samples] within a quarter of a distance D, arriving and leaving, over all visits.
+        far: Times within D.
+    """
+
+    visits: int
+    near: Float[np.ndarray, "2"]
+    far: Float[np.ndarray, "2"]
+
+    @property
+    def lasts(self) -> bool:
+        """Whether there are enough samples: twelve for each visit."""
+        return bool(np.sum(self.far) >= 12 * self.visits)
+
+    @property
+    def straight(self) -> bool:
+        """Whether D takes more than 2.5 times as long as D / 4."""
+        return bool(np.all(self.far > 2.5 * self.near))
 
 
 def _passing_times(
     z: Float[np.ndarray, " N"], there: Bool[np.ndarray, " N"], step: float, far: float
-) -> tuple[int, Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
-    """Number of visits to an end, and times [samples] within `far / 4` and `far`, arriving and leaving."""
+) -> _Passing:
+    """Visits to an end, with the times within the distances `far / 4` and `far` of it."""
     edges = np.flatnonzero(np.diff(z < far / 4, prepend=False, append=False))
     beyond = np.concatenate([[-np.inf], np.flatnonzero(z >= far), [np.inf]])
     visits, near_times, far_times = set(), np.zeros(2), np.zeros(2)
@@ -134,7 +157,7 @@ def _passing_times(
                 visits.add(start)
                 near_times[side] += near
                 far_times[side] += full
-    return len(visits), near_times, far_times
+    return _Passing(len(visits), near_times, far_times)
 
 
 def _is_driven(there: Bool[np.ndarray, " N"], u: Float[np.ndarray, " N"], Ts: float) -> bool:
