@@ -305,16 +305,32 @@ def test_a_refit_is_not_stopped_on_its_way(monkeypatch, plain, gains, alternatio
     start = dataclasses.replace(h, densities=np.zeros((2, 1)))
     calls = []
 
-    def fitted(_, x):
+    def fitted(_, point):
         calls.append(1)
-        more = next(left) if len(calls) > 1 else 0.0
-        return dataclasses.replace(x, densities=x.densities + more / 2)
+        h, more = point.hypothesis, next(left) if len(calls) > 1 else 0.0
+        return dataclasses.replace(point, hypothesis=dataclasses.replace(h, densities=h.densities + more / 2))
 
     monkeypatch.setattr(refit_module, "_fitted", fitted)
     monkeypatch.setattr(refit_module, "choose_process_noise", lambda problem, start, wide: start)
     end = refit(problem, [start], alternations=alternations)[0]
     assert len(calls) - 1 == taken
     assert end.log_likelihood == sum(gains[:taken])
+
+
+def test_a_refit_of_free_runs_computes_slopes_once_at_each_point(monkeypatch, rough):
+    runs, points = rough.of_free_runs(rough.windows), []
+    of_slopes = LikelihoodProblem.of_slopes
+
+    def counted(problem, use, hypotheses):
+        points.extend(h.z.tobytes() + h.local_z.tobytes() + h.x0.tobytes() for h in hypotheses)
+        return of_slopes(problem, use, hypotheses)
+
+    monkeypatch.setattr(LikelihoodProblem, "of_slopes", counted)
+    start = runs.with_likelihood(with_friction(runs, 0.01))
+    (end,) = refit(runs, [start])
+    assert end.log_likelihood > start.log_likelihood
+    assert len(points) > 3
+    assert len(set(points)) == len(points)
 
 
 @pytest.mark.parametrize("late", [Delay(time=0.0045), Delay(time=0.004), Lag(time=0.006), Lag(time=0.0007)])

@@ -220,6 +220,35 @@ def test_several_problems_end_as_each_alone_and_share_their_runs() -> None:
     assert progress.status.tolist() == [one.status for one in alone] == expected
 
 
+@pytest.mark.parametrize("case", ["rosenbrock", "rosenbrock, far"])
+def test_after_a_refused_step_costs_are_evaluated_alone(case: str) -> None:
+    """The points are those of a minimisation without it; no equations of a second refused step are made."""
+    residuals, start = CASES[case]
+    with double_precision():
+        made = plain(residuals)
+        whole, linearised, alone = (list[np.ndarray]() for _ in range(3))
+        usual = minimise(lambda x: (whole.append(x), made(x))[1], start, RULES, max_steps=300)
+        found = minimise(
+            lambda x: (linearised.append(x), made(x))[1],
+            start,
+            RULES,
+            cost=lambda x: (alone.append(x), float(made(x).cost))[1],
+            costs_after=1,
+            max_steps=300,
+        )
+        costs = [float(made(x).cost) for x in whole]
+    np.testing.assert_array_equal(found.x, usual.x)
+    assert (found.cost, found.status, found.evaluations) == (usual.cost, usual.status, usual.evaluations)
+    refused, expected = False, list[np.ndarray]()
+    for k in range(1, len(costs)):
+        if refused:
+            expected.append(whole[k])
+        refused = not costs[k] < min(costs[:k])
+    assert expected
+    np.testing.assert_array_equal(alone, expected)
+    assert len(linearised) < len(whole)
+
+
 def test_steps_may_act_on_anything() -> None:
     """The step changes the logarithm of a positive number, and the point is the number itself."""
     found = minimise(

@@ -339,44 +339,53 @@ EXTRA_ALTERNATIONS, EXTRA_ALTERNATION_NATS = 5, 10.0
 
 @dataclasses.dataclass
 class _Point:
-    """A hypothesis during its fit, with its innovations once it was run."""
+    """A hypothesis during its fit, with its innovations and their slopes once it was run."""
 
     hypothesis: Hypothesis
     innovations: Float[np.ndarray, "R N C"] | None = None
+    slopes: Float[np.ndarray, "D R N C"] | None = None
 
 
 def levenberg_marquardt(
     problem: LikelihoodProblem, hypotheses: Sequence[Hypothesis], max_steps: int = MAX_STEPS
 ) -> list[Hypothesis]:
     """Hypotheses fitted with fixed whiteners and process noise, and then evaluated with new whiteners."""
-    return on_threads(lambda h: _fitted(problem, h, max_steps), hypotheses)
+    return on_threads(lambda h: _fitted(problem, _Point(h), max_steps).hypothesis, hypotheses)
 
 
-def _fitted(problem: LikelihoodProblem, h: Hypothesis, max_steps: int = MAX_STEPS) -> Hypothesis:
+def _fitted(problem: LikelihoodProblem, start: _Point, max_steps: int = MAX_STEPS) -> _Point:
     """One hypothesis, fitted as in `levenberg_marquardt`."""
-    seen, coordinates = problem.seen, FitCoordinates.of(h, problem.windows)
+    h, seen = start.hypothesis, problem.seen
+    coordinates = FitCoordinates.of(h, problem.windows)
 
-    # Every trial computes slopes too: most steps are accepted, and a run without slopes is not much cheaper.
     def linearise(point: _Point) -> NormalEquations:
         here = point.hypothesis
+        if point.innovations is None or point.slopes is None:
+            run = problem.of_slopes(lambda _, e, J: (e, J[: here.moved]), [here])
+            ((point.innovations, point.slopes),) = run
+        w = here.whitener(point.innovations, seen)
+        H, g = coordinates.sums(w, here.whitener(point.slopes, seen))
+        return NormalEquations(np.array([0.5 * np.sum(w**2)]), g, H)
 
-        def equations(_: int, e: np.ndarray, J: np.ndarray) -> NormalEquations:
-            point.innovations = e
-            w = here.whitener(e, seen)
-            H, g = coordinates.sums(w, here.whitener(J[: here.moved], seen))
-            return NormalEquations(np.array([0.5 * np.sum(w**2)]), g, H)
+    def cost(point: _Point) -> float:
+        e = problem.innovations([point.hypothesis])[0]
+        point.innovations = e
+        return 0.5 * float(np.sum(point.hypothesis.whitener(e, seen) ** 2))
 
-        return problem.of_slopes(equations, [here])[0]
-
+    # A trial computes slopes too, since most steps of predictions are accepted. Half of the steps of free
+    # runs are refused, several in a row; after a refused step, a run without slopes comes first.
     found = minimise(
         linearise,
-        _Point(h),
+        start,
         REFIT_RULES,
+        cost=cost,
+        costs_after=1,
         limit=coordinates.step_limit(problem.step_limits(h)),
         move=lambda p, step: _Point(coordinates.moved(p.hypothesis, step)),
         max_steps=max_steps,
-    )
-    return problem.evaluated(found.x.hypothesis, found.x.innovations)
+    ).x
+    evaluated = problem.evaluated(found.hypothesis, found.innovations)
+    return dataclasses.replace(found, hypothesis=evaluated)
 
 
 def _grid(
@@ -459,15 +468,18 @@ def refit(
 
 def _refitted(problem: LikelihoodProblem, h: Hypothesis, wide: bool, alternations: int) -> Hypothesis:
     """One hypothesis, refitted as in `refit`."""
-    current = _fitted(problem, h)
+    current = _fitted(problem, _Point(h))
     for k in range(alternations + EXTRA_ALTERNATIONS if alternations else 0):
-        new = _fitted(problem, choose_process_noise(problem, current, wide and k == 0))
-        gain = new.log_likelihood - current.log_likelihood
+        before = current.hypothesis
+        start = choose_process_noise(problem, before, wide and k == 0)
+        # Free runs have no process noise: the next fit starts from slopes that are known.
+        new = _fitted(problem, current if start is before else _Point(start))
+        gain = new.hypothesis.log_likelihood - before.log_likelihood
         # A new whitener may lower the likelihood a little between alternations; the better fit is kept.
         current = new if gain > 0 else current
         if gain < (1.0 if k + 1 < alternations else EXTRA_ALTERNATION_NATS):
             break
-    return current
+    return current.hypothesis
 
 
 # Where friction sticks and slips at other samples, the slopes predict too large a decrease. Most steps need

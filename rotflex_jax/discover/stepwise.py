@@ -184,10 +184,11 @@ def _refit_candidate(problem: LikelihoodProblem, current: Hypothesis, start: Can
     likeliest = [problem.likeliest(row) for row in grown]
     if len(likeliest) > 1:
         likeliest = levenberg_marquardt(problem, likeliest, max_steps=SHAPE_CHOICE_STEPS)
-    (refitted,) = refit(problem, [max(likeliest, key=lambda h: h.log_likelihood)])
+    begun = max(likeliest, key=lambda h: h.log_likelihood)
+    (refitted,) = refit(problem, [begun])
     if refitted.log_likelihood - current.log_likelihood >= STUCK_SHARE * max(start.expected_gain, 0.0):
         return refitted
-    again = refit(problem, [row[-1] for row in grown])
+    again = refit(problem, [row[-1] for row in grown if row[-1] is not begun])
     refitted = max([refitted, *again], key=lambda h: h.log_likelihood)
     no_worse = refitted.log_likelihood > current.log_likelihood - MIN_DECREASE_NATS
     if no_worse or start.expected_gain <= 0 or not any(s.candidates[start.location].scaled):

@@ -57,8 +57,8 @@ PROGRESS_STEPS, LEAST_PROGRESS = 8, 0.1
 
 # Measured first states, and memories from a run over the whole recording, depend on the parameters. The last
 # stage is repeated with new ones until the cost converges: least and largest number of repetitions, and the
-# least gain that is worth a further one [nat].
-LEAST_REPETITIONS, MOST_REPETITIONS, SETTLED = 4, 6, 0.1
+# least gain that is worth a further one [nats that count].
+LEAST_REPETITIONS, MOST_REPETITIONS, SETTLED = 2, 6, 0.1
 
 # Least scale of a channel, as a share of the sensor noise.
 LEAST_SCALE = 0.1
@@ -269,7 +269,8 @@ class GreyBoxProblem:
                 history.append(float(cost))
                 if best is None or cost < best[0]:
                     best = cost, point, K, status
-                worth = repetition + 1 < LEAST_REPETITIONS or history[-1] < history[-2] - SETTLED
+                enough_gain = SETTLED * found.equations.nats_that_count
+                worth = repetition + 1 < LEAST_REPETITIONS or history[-1] < history[-2] - enough_gain
                 # Without a step, first states and gains have not changed either.
                 if status != "converged" or not moved or not worth:
                     break

@@ -347,6 +347,7 @@ def minimise_together(
     *,
     limit: Callable[[int], Any] | None = None,
     costs: Callable[[list[Any]], Sequence[float]] | None = None,
+    costs_after: int = 0,
     move: Callable[[Any, Any], Any] = np.add,
     unit: Callable[[Any], float] | None = None,
     max_steps: int = 60,
@@ -361,6 +362,8 @@ def minimise_together(
         limit: Returns the largest step along each coordinate of problem i; None for no limits.
         costs: Returns the costs at points, if these are cheaper than equations; None to use the cost of the
             equations.
+        costs_after: Number of steps refused in a row after which costs are evaluated alone; 0 for all steps.
+            After a refused step the next one is often refused too, and its equations would not be used.
         move: Returns the point after a step.
         unit: Returns from equations the unit, 1 or more, of `enough` and `least_progress`. It is called after
             each window of evaluations, and again before a minimisation ends by these.
@@ -370,7 +373,7 @@ def minimise_together(
     points, first = list(starts), list(linearise(list(starts)))
     equations = list(first)
     progress = [begin(np.float64(e.cost), rules) for e in equations]
-    units = [1.0] * len(points)
+    units, refused = [1.0] * len(points), [0] * len(points)
 
     def runs(i: int) -> bool:
         return bool(progress[i].status == Status.RUNNING) and bool(progress[i].evaluations < max_steps)
@@ -400,23 +403,27 @@ def minimise_together(
                 trials[i] = move(points[i], step)
         if not trials:
             break
-        tried = list(trials.values())
-        made = [] if costs else linearise(tried)
-        found = costs(tried) if costs else [e.cost for e in made]
+        alone = [i for i in trials if costs and refused[i] >= costs_after]
+        whole = [i for i in trials if i not in alone]
+        made = dict(zip(whole, linearise([trials[i] for i in whole]) if whole else [], strict=True))
+        found = {i: e.cost for i, e in made.items()}
+        if costs and alone:
+            found |= dict(zip(alone, costs([trials[i] for i in alone]), strict=True))
         accepted = []
-        for k, i in enumerate(trials):
-            progress[i], better = after_trial(progress[i], np.float64(found[k]), counted(i))
+        for i, trial in trials.items():
+            progress[i], better = after_trial(progress[i], np.float64(found[i]), counted(i))
+            refused[i] = 0 if better else refused[i] + 1
             if better:
-                points[i] = tried[k]
+                points[i] = trial
                 accepted.append(i)
-                if made:
-                    equations[i] = made[k]
+                if i in made:
+                    equations[i] = made[i]
             if ends_too_early(i):
                 progress[i] = progress[i]._replace(status=np.asarray(int(Status.RUNNING)))
             elif unit is not None and runs(i) and progress[i].evaluations % rules.window == 0:
                 units[i] = float(unit(equations[i]))
-        # If only costs were evaluated, equations are computed where another step follows.
-        follow = [i for i in accepted if runs(i)] if costs else []
+        # If only the cost was evaluated, equations are computed where another step follows.
+        follow = [i for i in accepted if i in alone and runs(i)]
         if follow:
             for i, e in zip(follow, linearise([points[i] for i in follow]), strict=True):
                 equations[i] = e
@@ -435,6 +442,7 @@ def minimise(
     *,
     limit: Any = None,
     cost: Callable[[Any], float] | None = None,
+    costs_after: int = 0,
     move: Callable[[Any, Any], Any] = np.add,
     unit: Callable[[Any], float] | None = None,
     max_steps: int = 60,
@@ -453,6 +461,7 @@ def minimise(
         rules,
         limit=None if limit is None else lambda _: limit,
         costs=None if cost is None else lambda points: [cost(x) for x in points],
+        costs_after=costs_after,
         move=move,
         unit=unit,
         max_steps=max_steps,
