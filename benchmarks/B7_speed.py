@@ -57,11 +57,10 @@ def run(chosen: argparse.Namespace) -> None:
 
     path = HERE / ("B7_plain.json" if chosen.plain else "B7.json")
     results = json.loads(path.read_text()) if path.exists() else {}
-    results["machine"] = machine()
     begin(results, __file__, sys.argv[1:])
     with Progress() as progress:
         for name in chosen.only:
-            results[name] = SUBSET[name](chosen, progress)
+            results[name] = {**SUBSET[name](chosen, progress), "machine": machine()}
             part(results, name)
             write_file(path, json.dumps(results, indent=1) + "\n")
     if not chosen.plain:

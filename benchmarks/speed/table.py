@@ -24,19 +24,18 @@ TITLES = {
 
 def page(results: dict[str, Any]) -> str:
     """The page with all results."""
-    m = results["machine"]
     lines = [
         "# Speed",
         "",
-        f"`python benchmarks/B7_speed.py` on {m['processor']}, {m['cores']} cores, Python {m['python']}, "
-        f"jax {m['jax']}, {m['date']}. Every row in turn and in random order, one process, compiling apart; "
-        "the ratio is to the first row of C or scipy in its table, of least processor times. Others used the "
-        "machine, so times by the clock are too long, and only what stands in one table may be compared.",
+        "`python benchmarks/B7_speed.py`. Every row in turn and in random order, one process, compiling "
+        "apart; the ratio is to the first row of C or scipy in its table, of least processor times. Others "
+        "used the machine, so times by the clock are too long. Tables were measured on different machines, "
+        "and only what stands in one table may be compared.",
     ]
     for name, title in TITLES.items():
         if name in results:
-            lines += ["", f"## {title}", ""]
             part = results[name]
+            lines += ["", f"## {title}", "", _measured_on(part["machine"]), ""]
             for group in part.get("groups", []):
                 lines += [*_rows(group), ""]
             lines += [f"- {what}: {value:.3g}" for what, value in part.get("facts", {}).items()]
@@ -48,6 +47,14 @@ def page(results: dict[str, Any]) -> str:
     while "\n\n\n" in text:
         text = text.replace("\n\n\n", "\n\n")
     return text.rstrip() + "\n"
+
+
+def _measured_on(machine: dict[str, Any]) -> str:
+    """Processor, versions and date of a part of the results."""
+    processor, cores, python, version, date = (
+        machine[k] for k in ("processor", "cores", "python", "jax", "date")
+    )
+    return f"{processor}, {cores} cores, Python {python}, jax {version}, {date}."
 
 
 def _rows(group: dict[str, Any]) -> list[str]:

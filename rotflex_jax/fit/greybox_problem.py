@@ -269,8 +269,9 @@ class GreyBoxProblem:
                 history.append(float(cost))
                 if best is None or cost < best[0]:
                     best = cost, point, K, status
-                enough_gain = SETTLED * found.equations.nats_that_count
-                worth = repetition + 1 < LEAST_REPETITIONS or history[-1] < history[-2] - enough_gain
+                worth = repetition + 1 < LEAST_REPETITIONS or (
+                    history[-2] - history[-1] > SETTLED * found.equations.nats_that_count
+                )
                 # Without a step, first states and gains have not changed either.
                 if status != "converged" or not moved or not worth:
                     break
