@@ -665,7 +665,6 @@ def arena_seconds() -> str:
     return f"{times[len(times) // 2]:.0f}"
 
 
-@named
 def arena_commit() -> str:
     """Revision of the code of the latest run."""
     return results("B0.json")["runs"][-1]["commit"]

@@ -68,6 +68,15 @@ def test_what_stands_between_marks_is_what_the_results_say(document: Path) -> No
     assert len(re.findall(r"<!--=(?!-->)", text)) == len(quoted.MARK.findall(text))
 
 
+def test_a_document_quotes_each_claim_that_has_a_function_of_its_own() -> None:
+    """A table that an edit has removed from a document would otherwise be missing without notice."""
+    text = "".join(p.read_text(encoding="utf-8") for p in quoted.documents())
+    marked = {mark["source"].strip() for mark in quoted.MARK.finditer(text)}
+    own = {name for name in claims.NAMED if name in vars(claims)}
+    assert own
+    assert own <= marked
+
+
 @pytest.mark.parametrize("page", quoted.pages(), ids=lambda p: p.name)
 def test_pages_say_which_code_their_results_are_of(page: Path) -> None:
     text = page.read_text(encoding="utf-8")
