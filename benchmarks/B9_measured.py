@@ -4,6 +4,7 @@
     python benchmarks/B9_measured.py --only rotflex two_dof_link_1
     python benchmarks/B9_measured.py --only "rotflex: A to B" --fresh
     python benchmarks/B9_measured.py --workers 16
+    python benchmarks/B9_measured.py --again --minutes 60 --workers 2 --methods
     python benchmarks/B9_measured.py --list
 
 A direction is a split of the recordings of a machine into training, validation and test data. The search is
@@ -18,18 +19,21 @@ programs, and no times are reported.
 
 Needs the recordings, fetched or in the folder named by `ROTFLEX_DATA`. Writes `results/B9.json` and the page
 `results/B9.md` after each direction. Directions that the file already contains are kept unless `--fresh` is
-given.
+given, or `--again`: it repeats those that were searched with another version of the code, one by one, so that
+it can be interrupted and continued.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import math
 import os
 import queue
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
@@ -68,9 +72,12 @@ def directions(only: list[str]) -> tuple[list[tuple[str, str]], dict[str, str]]:
 
 
 def side_by_side(
-    todo: list[tuple[str, str]], methods: list[str], workers: int
+    todo: list[tuple[str, str]], methods: list[str], workers: int, until: float
 ) -> Iterator[tuple[str, str, dict[str, Any]]]:
-    """Yields finished directions; each runs in a process on a separate core, and times are left out."""
+    """Yields finished directions; each runs in a process on a separate core, and times are left out.
+
+    None is started after the time `until` of the monotonic clock.
+    """
     free = queue.SimpleQueue[int]()
     for core in sorted(os.sched_getaffinity(0))[:workers]:
         free.put(core)
@@ -84,14 +91,18 @@ def side_by_side(
             return {"error": f"the process ended with {problem.returncode}"}
         finally:
             free.put(core)
-        for time in ("clock", "processor", "clock_s", "processor_s"):
-            row.pop(time, None)
+        for name in ("clock", "processor", "clock_s", "processor_s"):
+            row.pop(name, None)
         return row
 
     with tempfile.TemporaryDirectory() as cache, ThreadPoolExecutor(workers) as pool:
         running = {pool.submit(one, *way, cache): way for way in todo}
         for done in as_completed(running):
-            yield *running[done], done.result()
+            if time.monotonic() > until:
+                for waiting in running:
+                    waiting.cancel()
+            if not done.cancelled():
+                yield *running[done], done.result()
 
 
 def measured(machine: str, direction: str, methods: list[str], warm: bool) -> dict[str, Any]:
@@ -138,6 +149,8 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--workers", type=int, default=1, help="directions at the same time")
     parser.add_argument("--cold-only", action="store_true", help="No second search of each direction.")
     parser.add_argument("--fresh", action="store_true", help="Run again what the results have already.")
+    parser.add_argument("--again", action="store_true", help="known directions of other code, once more")
+    parser.add_argument("--minutes", type=float, default=math.inf, help="begin no direction after so long")
     parser.add_argument("--out", type=Path, default=HERE / "results" / "B9.json")
     return parser.parse_args()
 
@@ -160,12 +173,17 @@ def main() -> int:
     made = begin(results, __file__, sys.argv[1:], scripts=("measured_machines.child",))
     results["left_out"] = {**results.get("left_out", {}), **left_out}
     rows = results["rows"]
-    known = {key for key, row in rows.items() if "error" not in row and not a.fresh}
+    if a.again:
+        wanted = [way for way in wanted if ": ".join(way) in rows]
+    current = lambda row: "error" not in row and (not a.again or row.get("code") == made["code"])  # noqa: E731
+    known = {key for key, row in rows.items() if current(row) and not a.fresh}
     todo = [way for way in wanted if ": ".join(way) not in known]
+    print(f"{len(wanted)} directions, {len(wanted) - len(todo)} known, {len(todo)} to run", flush=True)
+    until = time.monotonic() + 60 * a.minutes
     if a.workers > 1:
-        done = side_by_side(todo, methods, a.workers)
+        done = side_by_side(todo, methods, a.workers, until)
     else:
-        done = ((*way, measured(*way, methods, not a.cold_only)) for way in todo)
+        done = ((*way, measured(*way, methods, not a.cold_only)) for way in todo if time.monotonic() < until)
     for count, (machine, direction, row) in enumerate(done, 1):
         key = f"{machine}: {direction}"
         head = {"machine": machine, "direction": direction}
