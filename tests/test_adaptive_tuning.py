@@ -286,7 +286,9 @@ def test_descent_survives_points_without_a_value() -> None:
         assert place.status == "minimum"
         steps = np.abs(np.diff(place.points, axis=0))
         assert np.max(steps) <= 1.0 + 1e-12
-    assert descend(lambda p: (np.full(1, np.nan), p), np.ones((1, 1)), 3)[0].status == "no finite value"
+    calls = []
+    (lost,) = descend(lambda p: (calls.append(p), (np.full(1, np.nan), p))[1], np.ones((1, 1)), 30)
+    assert lost.status == "no finite value" and len(calls) == 1
 
 
 def test_the_summary_names_the_objective_and_what_was_found(short: list[Recording]) -> None:

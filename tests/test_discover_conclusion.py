@@ -355,7 +355,7 @@ def answered():
 
 
 def test_the_best_standard_input_is_proposed_within_what_the_machine_has_borne(answered):
-    e, limits = answered.proposal, seen_limits(answered.train)
+    e, limits = answered.proposal, seen_limits(answered.train, answered.final.model)
     assert e.separates == ("delay@input", "lag@input")
     assert e.chosen.input in {"noise", "multisine", "prbs", "steps", "sweep"}
     assert np.max(np.abs(e.u)) <= limits.voltage == np.max(np.abs(answered.train[0].u))
@@ -450,13 +450,32 @@ def test_the_machine_has_borne_the_most_of_any_recording() -> None:
     both = tuple(
         Recording(u=u, y=y * scale, Ts=Ts) for u, scale, Ts in ((slow, 2.0, 0.01), (quick, 1.0, 0.02))
     )
-    limits = seen_limits(both)
+    joint = rf.Model(rf.joints.paper())
+    limits = seen_limits(both, joint)
     assert limits.voltage == pytest.approx(np.max(np.abs(slow)))
     assert limits.slew == pytest.approx(np.max(np.abs(np.diff(quick))) / 0.02)
-    assert limits.deflection == pytest.approx(0.2)
     assert limits.margin == 0.0
+    # From its start, which is the largest value of the cosine: the way to the least one.
+    assert limits.deflection == pytest.approx(0.1 * 2.0 * (1 - np.cos(k / 9).min()))
     alone = tuple(Recording(u=r.u, y=r.y[:, :1], Ts=r.Ts) for r in both)
-    assert seen_limits(alone).deflection == np.inf
+    bare = rf.joints.paper()
+    single = dataclasses.replace(bare, outputs=bare.outputs[:1])
+    assert seen_limits(alone, rf.Model(single)).deflection == np.inf
+
+
+def test_the_deflection_is_that_of_the_model_in_any_order_of_the_columns() -> None:
+    k = np.arange(60)
+    theta, alpha, current = np.sin(k / 9), 0.1 * np.sin(k / 9), 5 * np.cos(k / 5)
+    one, other = (
+        Recording(u=np.sin(k / 20), y=np.column_stack(columns), Ts=0.01, channels=names, units=units)
+        for columns, names, units in (
+            ((theta, alpha, current), ("theta", "alpha", "current"), ("rad", "rad", "A")),
+            ((alpha, theta), ("alpha", "theta"), ("rad", "rad")),
+        )
+    )
+    for recording in (one, other):
+        limits = seen_limits([recording], rf.Model(rf.joints.paper()))
+        assert limits.deflection == pytest.approx(np.abs(alpha).max())
 
 
 def test_sizes_in_windows_by_hand() -> None:
@@ -578,17 +597,18 @@ def test_the_first_effect_with_an_equal_is_asked_about(monkeypatch: pytest.Monke
             ("dahl", (("lugre", "hub"),)),
         )
     ]
+    machine = rf.Model(rf.joints.paper())
     found: Any = SimpleNamespace(
         rounds=rounds,
         train=(short,),
         validation=(long,),
         noise_floor={"theta": 1e-3},
-        final=SimpleNamespace(process_noise={"hub": 0.0}, model="the model"),
+        final=SimpleNamespace(process_noise={"hub": 0.0}, model=machine),
         model="one of the final fit",
     )
     given, settings = proposed(found, Ts=0.5)  # pyright: ignore[reportGeneralTypeIssues]
-    assert given == ("the model", ("coulomb", "hub"), ("stribeck", "hub"))
-    assert settings["Ts"] == 0.5 and settings["limits"] == seen_limits((short, long))
+    assert given == (machine, ("coulomb", "hub"), ("stribeck", "hub"))
+    assert settings["Ts"] == 0.5 and settings["limits"] == seen_limits((short, long), machine)
     np.testing.assert_array_equal(settings["reference"], long.u[:1000])
     # A periodic disturbance has another phase in the next recording, so pairs with one are skipped.
     (line,) = (name for name, effect in fx.CATALOG.items() if effect.line)

@@ -8,7 +8,7 @@ from scipy.signal import butter, lfilter, sosfilt
 
 import rotflex_jax as rf
 from rotflex_jax.discover import locate
-from rotflex_jax.discover.localise import condition_sets, missing_acceleration
+from rotflex_jax.discover.localise import condition_sets, locate_in_windows, missing_acceleration
 from rotflex_jax.errors import InputError
 from rotflex_jax.joints import paper, xl330_pendulum
 from rotflex_jax.recording import Recording
@@ -313,3 +313,11 @@ def test_what_does_not_fit_is_refused(moving) -> None:
     bad[7, 0] = np.nan
     with pytest.raises(InputError, match="1 of them not finite"):
         locate(moving, bad, moving.channels, NOISE)
+
+
+def test_runs_that_diverge_are_said_to(moving) -> None:
+    model = rf.Model(rf.joints.paper())
+    runs = np.zeros((moving.N, 2))
+    runs[50:, 1] = np.inf
+    (told,) = locate_in_windows(model, moving, runs, np.full(2, 1e-3), 2.0)
+    assert "diverge" in told.statement and told.p_value == 1.0

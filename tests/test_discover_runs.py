@@ -9,6 +9,7 @@ from test_discover_final_fit import OFFSET, run, short_runs_miss
 import rotflex_jax as rf
 from rotflex_jax.discover.result import KnownRuns
 from rotflex_jax.effects import Coulomb
+from rotflex_jax.errors import InputError
 from rotflex_jax.recording.recording import digest_of_recordings, joined, of_one_run
 
 
@@ -116,3 +117,11 @@ def test_an_offset_that_two_runs_share_is_the_machine_s(parts):
     assert found.model_of(unseen) == found.model
     assert not any("seen in one run" in note for note in found.notes)
     assert OFFSET in found.model.mechanism.parameter_names
+
+
+def test_a_torque_is_learned_only_beside_validation_data(found):
+    alone = dataclasses.replace(found, validation=found.train)
+    with pytest.raises(InputError, match="needs validation data"):
+        alone.learned_torque()
+    with pytest.raises(InputError, match="needs validation data"):
+        alone.explanation(learned=True)

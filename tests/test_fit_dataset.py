@@ -24,7 +24,7 @@ from rotflex_jax.mechanism.sensitivities import (
     outputs_with_sensitivities,
 )
 from rotflex_jax.mechanism.simulate import simulate
-from rotflex_jax.metrics import window_starts
+from rotflex_jax.metrics import counted, window_starts
 from rotflex_jax.models.model import Model
 from rotflex_jax.runtime.persistent_jit import program_counts
 from rotflex_jax.runtime.xla import double_precision
@@ -196,6 +196,23 @@ def test_the_first_seconds_give_a_run_its_offset(horizons):
     found = early.values(s)[:, s.mechanism.parameter_names.index("input.voltage_offset.offset")]
     np.testing.assert_allclose(found, [offset + 0.02, offset - 0.02], atol=0.01)
     assert Windows.whole(problem.dataset).number == 1
+
+
+def test_runs_that_validate_each_other_count_by_their_samples():
+    """The error of all runs is that of their samples together: a short run does not count like a long one."""
+    long, short = sp.recordings(sp.records(0.0))
+    made = (long, short.slice(0, short.N // 4))
+    problem = sp.problem(made, sp.supermodel_of(sp.WANTED, made))
+    both = Horizons.of(Model(sp.baseline()), problem, None, SECONDS).free_run
+    h = as_free_run(both.problem, fit_baseline(problem))
+    found = validate(both.validation, h)
+    each = [
+        validate(fold.validation, fitted).window_rmse
+        for fold, fitted in zip(both.validation.folds, found.folds, strict=True)
+    ]
+    samples = [counted(r, SECONDS).sum() for r in made]
+    together = np.sqrt(np.average(np.square(each), axis=0, weights=samples))
+    np.testing.assert_allclose(found.window_rmse, together, rtol=1e-3)
 
 
 def test_one_recording_alone_cannot_validate_itself():

@@ -9,7 +9,7 @@ from hypothesis import given, settings, strategies as st
 from rotflex_jax.basis import Delays, GramSchmidt, Orthonormal, Volterra
 from rotflex_jax.data.excitation import noise
 from rotflex_jax.errors import InputError
-from rotflex_jax.fit import least_squares
+from rotflex_jax.fit import forward_regression, least_squares
 from rotflex_jax.fit.linear import ROWS_PER_FACTOR, RegressionRows, factor, solve
 from rotflex_jax.recording import Recording
 from rotflex_jax.reproduce.plants import plant, response
@@ -117,6 +117,16 @@ def test_a_column_of_zeros_has_no_interval() -> None:
     silent = least_squares(Volterra(Delays(2), 1), late)  # the impulse is in the samples that are left out
     assert np.isnan(silent.std[1:]).all()
     assert silent["u[t]"].note == "not determined by these data"
+
+
+def test_where_no_weight_is_determined_none_has_an_interval() -> None:
+    u = np.zeros(300)
+    r = Recording(u=u, y=np.cos(np.arange(300.0)), Ts=0.1, channels="alpha", accept=("constant_input",))
+    for fit in (
+        least_squares(Volterra(Delays(3), 1, constant=False), r),
+        forward_regression(Volterra(Delays(3), 1, constant=False), r),
+    ):
+        assert not fit.weights.any() and np.isnan(fit.std).all()
 
 
 def test_several_recordings_count_as_one_but_do_not_touch() -> None:

@@ -246,3 +246,33 @@ def test_a_difference_may_be_negative():
     assert p.shape == "closed" and p.limits == (-np.inf, np.inf)
     np.testing.assert_allclose(p.interval(), (low - shift, high - shift), rtol=0, atol=0.01 * p.std)
     assert rf.profile(fitted(), recording(), lambda values: 1 / values[CONSTANT]).limits == (0.0, np.inf)
+
+
+def test_a_profile_has_the_ranges_of_its_fit():
+    """A damper that begins at a negative value may stay negative, in the fit and in its profile."""
+    damper = rf.effects.Viscous("hub", coefficient=-0.003)
+    name = "hub.viscous.coefficient"
+    m = (axis() + damper).trust(CONSTANT, INERTIA)
+    assert m.free_names == (name,)
+    u = rf.data.excitation.multisine(N, TS, seed=1)
+    y = rf.simulate(m.with_values({name: -0.0008}), u, TS)
+    noisy = y + NOISE * np.random.default_rng(1).normal(size=y.shape)
+    data = rf.Recording(u=u, y=noisy, Ts=TS, channels=("theta",))
+    found = rf.fit(m, data)
+    p = rf.profile(found, data, name)
+    assert p.value < 0
+    low, high = p.interval(0.95)
+    width = found[name].std
+    assert low == pytest.approx(p.value - 1.96 * width, abs=0.3 * width)
+    assert high == pytest.approx(p.value + 1.96 * width, abs=0.3 * width)
+
+
+def test_a_fit_whose_only_parameter_ends_at_its_bound_has_no_interval():
+    name = "hub.viscous.coefficient"
+    m = (axis() + rf.effects.Viscous("hub", coefficient=0.002)).trust(CONSTANT, INERTIA)
+    u = rf.data.excitation.multisine(N, TS, seed=1)
+    y = rf.simulate(m.with_values({name: -0.0008}), u, TS)
+    noisy = y + 1e-4 * np.random.default_rng(1).normal(size=y.shape)
+    found = rf.fit(m, rf.Recording(u=u, y=noisy, Ts=TS, channels=("theta",)), first="measured")
+    assert found[name].value == 0 and "bound" in found[name].note
+    assert np.isnan(found[name].std)

@@ -15,7 +15,7 @@ from rotflex_jax.data.excitation import noise, prbs, steps
 from rotflex_jax.errors import InputError
 from rotflex_jax.recording import Finding, Recording
 from rotflex_jax.recording.quality import quantisation_step
-from rotflex_jax.recording.recording import digest_of_recordings, joined
+from rotflex_jax.recording.recording import digest_of_recordings, joined, of_one_run
 
 Ts = 0.002
 COUNT = 2 * np.pi / 4096
@@ -142,6 +142,24 @@ def test_decimation_keeps_the_impulse_of_the_input_and_the_measured_outputs() ->
     np.testing.assert_allclose(np.sum(slow.u) * slow.Ts, np.sum(u[:1000]) * Ts)
     with pytest.raises(InputError, match="whole number"):
         slow.decimate(0)
+
+
+def test_parts_are_of_one_run_before_and_after_decimation() -> None:
+    u, y = swinging(2000)
+    whole, other = Recording(u=u, y=y, Ts=Ts), Recording(u=u, y=y + np.sin(np.arange(2000))[:, None], Ts=Ts)
+    first, second = whole.split(0.5)
+    for a, b in ((first.decimate(2), second.decimate(2)), (first.decimate(3), second.decimate(3))):
+        assert of_one_run(a, b) and of_one_run(b, first) and of_one_run(whole.decimate(5), a)
+        assert not of_one_run(a, other.split(0.5)[1].decimate(2))
+    # Decimated and then joined, they are the whole one decimated, if the cut lies between groups.
+    (again,) = joined([first.decimate(2), second.decimate(2)])
+    np.testing.assert_array_equal(again.y, whole.decimate(2).y)
+    np.testing.assert_allclose(again.u, whole.decimate(2).u, rtol=1e-12)
+    before = second.decimate(3).continues
+    assert before is not None and before.start + before.duration == pytest.approx(second.start)
+    near = whole.slice(2, 2000).decimate(3)  # there is no whole group of samples before it
+    assert near.continues is None and of_one_run(near, whole)
+    assert of_one_run(pickle.loads(pickle.dumps(first.decimate(2))), second)
 
 
 BASE, MOTOR = "acceleration of the base [m/s^2]", "second motor [A]"

@@ -28,6 +28,7 @@ from rotflex_jax.effects.labels import effect_phrase
 from rotflex_jax.errors import InputError
 from rotflex_jax.experiment import Experiment, Limits, next_experiment
 from rotflex_jax.fit.coordinates import orthogonal_to
+from rotflex_jax.models.model import Model
 from rotflex_jax.recording import Recording
 
 # Orthogonal fraction below which a candidate can hardly be distinguished from the model.
@@ -129,7 +130,7 @@ def proposed(found: SearchResult, **changes: Any) -> Experiment | None:
     longest = max(recordings, key=lambda r: r.N)
     first, second = pairs[0]
     settings: dict[str, Any] = {
-        "limits": seen_limits(recordings),
+        "limits": seen_limits(recordings, found.final.model),
         "Ts": longest.Ts,
         "noise": found.noise_floor,
         "process_noise": found.final.process_noise,
@@ -139,18 +140,19 @@ def proposed(found: SearchResult, **changes: Any) -> Experiment | None:
     return next_experiment(found.final.model, first, second, **(settings | changes))
 
 
-def seen_limits(recordings: tuple[Recording, ...]) -> Limits:
-    """Limits that the machine has withstood: largest voltage, slew rate and deflection of the recordings."""
-    r = max(recordings, key=lambda r: float(np.max(np.abs(r.u))))
+def seen_limits(recordings: Sequence[Recording], model: Model) -> Limits:
+    """Limits that the machine has withstood: largest voltage, slew rate and deflection of the recordings.
+
+    The deflection is the second output of the model, whatever the order of the columns of a recording. It
+    counts from its start.
+    """
+    voltage = max(float(np.max(np.abs(r.u))) for r in recordings)
     slew = max(float(np.max(np.abs(np.diff(r.u)))) / r.Ts for r in recordings)
-    deflection = max(float(np.max(np.abs(r.y[:, -1]))) for r in recordings)
-    single = len(r.channels) < 2
-    return Limits(
-        voltage=float(np.max(np.abs(r.u))),
-        slew=slew,
-        deflection=np.inf if single else deflection,
-        margin=0.0,
-    )
+    limits = Limits(voltage=voltage, slew=slew, margin=0.0)
+    if len(model.mechanism.channels) < 2:
+        return limits
+    seen = [np.asarray(model.measured(r), float)[:, 1] for r in recordings]
+    return dataclasses.replace(limits, deflection=max(float(np.max(np.abs(y - y[0]))) for y in seen))
 
 
 # Limits for an effect of the machine: largest root mean square change of its size between windows, over the

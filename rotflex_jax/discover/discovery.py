@@ -65,7 +65,7 @@ class Discovery(SearchResult):
 
     def latent_torque(self, progress: Callable[[str], None] | None = None) -> LatentTorqueComparison:
         """Torques that the baseline and the final model lack, on a fitted and a validation recording."""
-        groups = (self.train, self.validation) if self.validation != self.train else (self.train,)
+        groups = (self.train, self.validation) if self.held_back else (self.train,)
         # A periodic disturbance has the phase of the first recording in this model.
         if any(e.line for e in self.final.model.mechanism.effects):
             groups = (self.train[:1],)
@@ -80,7 +80,15 @@ class Discovery(SearchResult):
         Args:
             at: Port of the torque.
             progress: Called with a line of text at each stage.
+
+        Raises:
+            InputError: If the search had no validation data, by which the smoothness of the map is chosen.
         """
+        if not self.held_back:
+            raise InputError(
+                "A learned torque needs validation data, but the training recordings of this search validate "
+                "each other; give `rf.discover` a recording as its `validation`."
+            )
         seconds, m = self.baseline.window_seconds, self.final.model.mechanism  # not fitted to validation data
         for effect in [e for e in m.effects if e.line]:  # its phase belongs to one recording
             m = m.without(effect.name, effect.at)
@@ -107,18 +115,25 @@ class Discovery(SearchResult):
 
         Args:
             learned: Whether to learn a torque at the port where most is left; if None, it is learned if the
-                verdict is `unexplained`.
+                verdict is `unexplained` and there are validation data.
             progress: Called with a line of text at each stage.
+
+        Raises:
+            InputError: If a torque is to be learned without validation data.
         """
         say = checks.progress(progress)
         say("report: torques that the models lack")
         latent, torque = self.latent_torque(progress), None
-        if self.verdict == Verdict.UNEXPLAINED if learned is None else learned:
+        if learned is None:
+            learned = self.verdict == Verdict.UNEXPLAINED and self.held_back
+        if learned:
             gains = (latent.after or latent.before).gain_nats
             try:
                 torque = self.learned_torque(max(gains, key=lambda port: gains[port]), progress)
-            except InputError:  # the sensors do not determine the motion of that port
-                torque = None
+            except InputError:
+                if not self.held_back:
+                    raise
+                torque = None  # the sensors do not determine the motion of that port
         say("report: tests of the residuals and frequency responses")
         tests = model_tests(self)
         say("report: what the recording determines")

@@ -9,7 +9,7 @@ import scipy
 from jaxtyping import Float
 
 from rotflex_jax.discover.learned_torque import LearnedTorqueResult
-from rotflex_jax.discover.localise import locate
+from rotflex_jax.discover.localise import locate_in_windows
 from rotflex_jax.discover.result import SearchResult, Stage, Where
 from rotflex_jax.discover.verdict import Verdict
 from rotflex_jax.effects import CATALOG
@@ -311,12 +311,5 @@ def remaining_failures(found: SearchResult) -> tuple[Where, ...]:
         return ()
     i = found.longest_validation
     recording, final = found.validation[i], found.final
-    mechanism = final.model.mechanism
-    return locate(
-        recording,
-        np.asarray(found.baseline.model.measured(recording), float) - np.asarray(final.windowed[i], float),
-        mechanism.channels,
-        found.noise_floor,
-        mechanism,
-        window_seconds=final.window_seconds,
-    )
+    runs, seconds = final.windowed[i], final.window_seconds
+    return locate_in_windows(final.model, recording, runs, found.noise_floor, seconds)

@@ -14,6 +14,7 @@ from rotflex_jax.errors import InputError
 from rotflex_jax.fit.inference import correlation_length
 from rotflex_jax.mechanism import Mechanism
 from rotflex_jax.metrics import window_starts
+from rotflex_jax.models.model import Model
 from rotflex_jax.recording import Recording
 from rotflex_jax.recording.recording import single
 from rotflex_jax.recording.smoothing import local_polynomial, smoothed
@@ -509,6 +510,32 @@ def locate(
     ]
     notable.sort(key=lambda f: (f.where.kind == "frequency", -float(relative_entropy(f.share, f.expected))))
     return tuple(f.where for f in notable) or (_nothing_stands_out(e, channels, noise),)
+
+
+def locate_in_windows(
+    model: Model,
+    recording: Recording,
+    simulated: Real[np.ndarray, "N C"],
+    noise: Mapping[str, float] | Real[np.ndarray, " C"],
+    window_seconds: float,
+) -> tuple[Where, ...]:
+    """`locate` for free runs of a model over windows of a recording, which may diverge.
+
+    Args:
+        model: The model.
+        recording: What was measured.
+        simulated: Its runs.
+        noise: Standard deviation of the sensor noise by channel, or in the order of the channels.
+        window_seconds: Length of the windows [s].
+    """
+    residual, channels = model.measured(recording) - np.asarray(simulated, float), model.mechanism.channels
+    if not np.isfinite(residual).all():
+        what = (
+            f"Free runs over {window_seconds:g} s diverge, so that their error does not show what is missing."
+        )
+        none = np.zeros(0)
+        return (Where(what, 1.0, 1.0, "time", ", ".join(channels), none, none, none, "s"),)
+    return locate(recording, residual, channels, noise, model.mechanism, window_seconds=window_seconds)
 
 
 def _numbers(given: Any) -> Float[np.ndarray, "..."]:

@@ -615,6 +615,11 @@ class SearchResult:
         return (self.baseline, *(r.stage for r in self.rounds))
 
     @property
+    def held_back(self) -> bool:
+        """Whether validation recordings were held back; if not, training recordings validated each other."""
+        return self.validation != self.train
+
+    @property
     def longest_validation(self) -> int:
         """Index of the longest validation recording, the first of several equally long ones."""
         return max(range(len(self.validation)), key=lambda k: self.validation[k].N)

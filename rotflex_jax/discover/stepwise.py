@@ -491,7 +491,7 @@ def merge_effects(
         starts.append(with_effect(s, bare, CandidateStart(rich, values), 1.0))
     fitted = refit(problem, starts, alternations=1)
     (simple, rich), one = max(zip(pairs, fitted, strict=True), key=lambda pair: pair[1].log_likelihood)
-    before = len(s.parameter_indices(simple)) + len(h.x0) * len(calibrations)
+    before = parameter_count(s, h, simple) + len(h.x0) * len(calibrations)
     saved = before - len(s.parameter_indices(rich))
     allowed = MERGE_LOSS_NATS + 0.5 * saved * np.log(problem.measured_values)
     if saved < 0 or one.log_likelihood < h.log_likelihood - allowed or not is_physical(s, one, rich):

@@ -22,7 +22,7 @@ from rotflex_jax.discover.final_fit import Refused, fit_to_all
 from rotflex_jax.discover.friction_of_runs import own_friction_notes
 from rotflex_jax.discover.hypothesis import Hypothesis
 from rotflex_jax.discover.likelihood import choose_process_noise, finer_integration
-from rotflex_jax.discover.localise import locate
+from rotflex_jax.discover.localise import locate_in_windows
 from rotflex_jax.discover.probabilities import Probabilities, fitted_sets, probabilities
 from rotflex_jax.discover.result import (
     ConditionalInterval,
@@ -104,11 +104,11 @@ def evaluate_models(state: SearchState, evaluation: Evaluation) -> EvaluatedMode
 
     stages = on_threads(stage, range(len(models)))
     train, held_back = problem.dataset.recordings, validation.problem.dataset.recordings
-    longest, channels = longest_recording(train, held_back), model.mechanism.channels
+    longest = longest_recording(train, held_back)
     seconds, noise = validation.window_seconds, problem.noise
     of_run = KnownRuns.of(train, held_back).index(longest) or 0
     as_it_is = built.model_of(models[0], (), of_run)
-    residual = model.measured(longest) - as_it_is.simulate_windows(longest, seconds)
+    runs = as_it_is.simulate_windows(longest, seconds)
     pairs = paired_estimates(reported, validated[-1], stages[-1].estimates)
     m = stages[-1].model.mechanism
     remarks = (*at_bounds(stages[-1].estimates), *beyond_recordings(m, state.reach))
@@ -119,7 +119,7 @@ def evaluate_models(state: SearchState, evaluation: Evaluation) -> EvaluatedMode
         pairs=pairs,
         remarks=remarks,
         rounds=_rounds(state, stages, pairs, remarks, {} if explained else stand_ins(state)),
-        where=locate(longest, residual, channels, noise, model.mechanism, window_seconds=seconds),
+        where=locate_in_windows(model, longest, runs, noise, seconds),
         test=evaluation.recordings,
         final_fit=None if explained else fit_to_all(state, stages[-1], validated[-1], evaluation),
     )
@@ -136,7 +136,7 @@ def conclude(state: SearchState, evaluated: EvaluatedModels, started: float) -> 
     baseline, final = evaluated.stages[0], evaluated.stages[-1]
     supermodel, remarks = state.problem.supermodel, evaluated.remarks
     held_back = state.validation.problem.dataset.recordings
-    conditional, last = _conditional(state), evaluated.final_fit
+    conditional, last = _conditional(state, final), evaluated.final_fit
     used = last.model if isinstance(last, FinalFit) else final.model
     scores = [s for s, _ in state.ranking]
     verdict, sentence = end_state(baseline, evaluated.rounds, final, state.noise_floor, scores)
@@ -185,14 +185,18 @@ def _probabilities(state: SearchState, misfit: float) -> Probabilities:
     return probabilities(sets, misfit=misfit)
 
 
-def _conditional(state: SearchState) -> tuple[ConditionalInterval, ...]:
-    """Parameters of the machine on which fits of the final model to predictions and free runs disagree."""
+def _conditional(state: SearchState, final: Stage) -> tuple[ConditionalInterval, ...]:
+    """Parameters of the final model on which fits to predictions and to free runs disagree.
+
+    Those of effects that were merged into another one are left out.
+    """
     horizons, s = state.horizons, state.problem.supermodel
     if (runs := state.current.free_run) is None:
         return ()
     own = {s.mechanism.parameter_names[i] for i in state.current.hypothesis.local}
+    names = {e.name for e in final.estimates} - own
     each = (
-        [e for e in estimates(at.problem, found.hypothesis) if e.name not in own]
+        [e for e in estimates(at.problem, found.hypothesis) if e.name in names]
         for at, found in ((horizons.prediction, state.current), (horizons.free_run, runs))
     )
     return excluding(*each)

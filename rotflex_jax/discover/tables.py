@@ -180,9 +180,7 @@ def final_fit_sentence(discovery: SearchResult) -> str:
     found = discovery.final_fit
     if found is None:
         return ""
-    used = (
-        "all recordings" if discovery.validation == discovery.train else "training and validation recordings"
-    )
+    used = "training and validation recordings" if discovery.held_back else "all recordings"
     before, after = found.searched.windows, found.trained.windows
     shown = []
     for channel, unit in channel_units(discovery).items():

@@ -19,7 +19,7 @@ from rotflex_jax.discover.likelihood import DIVERGED, LikelihoodProblem, in_bloc
 from rotflex_jax.discover.supermodel import EffectLocation, SuperModel
 from rotflex_jax.fit.coordinates import FitCoordinates
 from rotflex_jax.fit.dataset import Dataset, Windows
-from rotflex_jax.metrics import window_starts, windowed_rmse
+from rotflex_jax.metrics import counted, window_starts, windowed_rmse
 from rotflex_jax.models.model import Model
 from rotflex_jax.optimise.damped_least_squares import NormalEquations, Rules, minimise_together
 from rotflex_jax.runtime.xla import on_threads
@@ -319,7 +319,9 @@ def _cross_validated(
         x0=np.array([v.adapted.x0[k] for k, v in enumerate(found)]),
         K=np.array([v.adapted.K[k] for k, v in enumerate(found)]),
     )
-    rmse = np.sqrt(np.mean([v.window_rmse**2 for v in found], axis=0))
+    # Errors of all recordings together, in which each sample has the same weight.
+    scored = [counted(r, validation.window_seconds).sum() for r in validation.problem.dataset.recordings]
+    rmse = np.sqrt(np.average([v.window_rmse**2 for v in found], axis=0, weights=scored))
     blocks = np.concatenate([v.blocks for v in found])
     return ValidatedHypothesis(h, blocks, adapted, rmse, folds=tuple(fits))
 

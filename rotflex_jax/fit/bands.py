@@ -373,7 +373,8 @@ def _run(
         own = own + variance * np.square(whole[..., fitted.free_names.index(name)])
     if own.any():
         parts["own of each recording"] = own
-    _refuse_growing(model, recording, parts, np.maximum(np.ptp(y, axis=0), noise))
+    # The motion of the run: the recording may be a planned one, of which only the first samples are real.
+    _refuse_growing(model, recording, parts, np.maximum(np.ptp(y_hat, axis=0), noise))
     if fitted.options.process_noise is not None:
         parts["process torque"] = _process_variance(m, fitted.options.process_noise, recording)
     return y_hat, parts

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float
 
 from rotflex_jax.fit.greybox_problem import LEAST_SCALE, FitAttempt, GreyBoxProblem
-from rotflex_jax.fit.inference import RecordingSlopes, scaled_inverse
+from rotflex_jax.fit.inference import RecordingSlopes, flattened, scaled_inverse
 from rotflex_jax.fit.plausibility import Remark
 from rotflex_jax.fit.problem import negative_log_likelihood
 from rotflex_jax.mechanism import Exponential
@@ -82,7 +82,7 @@ def finer_steps(
     none = np.zeros((*e.shape, 0))  # no slopes of the differences: `parts` only divides them into windows
     gradient = np.zeros(len(H))
     for part, change in zip(parts, coordinates.parts((fine - e) / scale, none, seen), strict=True):
-        gradient[part.columns] += part.J.reshape(-1, len(part.columns)).T @ change.e.ravel()
+        gradient[part.columns] += flattened(part.J).T @ change.e.ravel()
     inverse, size = scaled_inverse(H)
     step = np.zeros(len(moves))
     step[moves] = -(inverse @ (gradient / size)) / size

@@ -241,7 +241,8 @@ def fit(
     # A robust fit only begins with squares, and its large errors would cause restarts in vain.
     problem = _problem(model, given, first, max_steps, 0 if robust else restarts, minimiser, devices, say)
     asked = None if process_noise is None else dict(process_noise)
-    options = FitOptions(asked, local, first, window_seconds, max_steps, problem.restarts)
+    low, high = (tuple(end.tolist()) for end in problem.ranges)
+    options = FitOptions(asked, local, first, window_seconds, max_steps, problem.restarts, ranges=(low, high))
     with double_precision():
         end = problem.solve([names.index(n) for n in local], process_noise, window_seconds)
         if robust is not None and np.isfinite(end.cost):
@@ -278,6 +279,9 @@ def problem_of(fitted: Fit, recordings: Sequence[Recording]) -> tuple[GreyBoxPro
             "Recordings, or settings of them such as n_init, differ from those of the fit, but a profile "
             "fits the same data again with one quantity held; give those that were fitted, or fit these."
         )
+    if asked.ranges is not None:
+        low, high = map(np.array, asked.ranges)
+        problem = dataclasses.replace(problem, ranges=(low, high))
     if asked.bend is not None:
         problem = dataclasses.replace(problem, bend=np.array(asked.bend))
     windows = problem.horizons(asked.window_seconds, asked.process_noise)[-1]

@@ -66,9 +66,14 @@ def curvature(parts: Sequence[RecordingSlopes], size: int) -> Float[np.ndarray, 
         return np.full((size, size), np.nan)
     H = np.zeros((size, size))
     for J, _, columns in parts:
-        flat = J.reshape(-1, len(columns))
+        flat = flattened(J)
         H[np.ix_(columns, columns)] += flat.T @ flat
     return H
+
+
+def flattened(J: Float[np.ndarray, "N C D"]) -> Float[np.ndarray, "NC D"]:
+    """Slopes with samples and channels along one axis, also if there is no coordinate."""
+    return J.reshape(J.shape[0] * J.shape[1], J.shape[2])
 
 
 def long_run_scores(parts: Sequence[RecordingSlopes], size: int) -> Float[np.ndarray, "D D"]:
@@ -140,7 +145,7 @@ def sandwich(parts: Sequence[RecordingSlopes], H: Float[np.ndarray, "D D"]) -> F
     white, S = np.zeros((size, size)), long_run_scores(parts, size)
     for J, _, columns in parts:
         own = np.ix_(columns, columns)
-        white[own] += J.reshape(-1, len(columns)).T @ (residual_covariance @ J).reshape(-1, len(columns))
+        white[own] += flattened(J).T @ flattened(residual_covariance @ J)
     # Scaled to a unit diagonal, an eigenvalue at the level of rounding belongs to a direction that the data
     # do not determine. Its parameters get no interval instead of a narrow one.
     scale = np.sqrt(np.maximum(np.diag(H), 1e-300))

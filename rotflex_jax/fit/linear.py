@@ -64,7 +64,7 @@ def solve(R: Float[np.ndarray, "K columns"], ridge: float = 0.0) -> Solution:
     # on their sizes.
     unit = np.where(size > 0, size, 1.0) if ridge == 0 else np.ones_like(size)
     U, s, Vt = np.linalg.svd(A / unit, full_matrices=False)
-    kept = s > DEPENDENT_COLUMN_SHARE * max(s[0], 1e-300)
+    kept = s > DEPENDENT_COLUMN_SHARE * max(s.max(initial=0.0), 1e-300)
     U, s, V = U[:, kept], s[kept], Vt[kept].T
     shrink = s**2 / (s**2 + ridge)
     basis = V / unit[:, None]

@@ -24,7 +24,7 @@ from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from rotflex_jax.fit.coordinates import FitCoordinates
 from rotflex_jax.fit.dataset import StackedRecordings
-from rotflex_jax.fit.inference import RecordingSlopes, curvature, nats_that_count
+from rotflex_jax.fit.inference import RecordingSlopes, curvature, flattened, nats_that_count
 from rotflex_jax.mechanism import Mechanism, Solver, predictor_run
 from rotflex_jax.mechanism.assembly import Layout, rest_state, whole_state
 from rotflex_jax.mechanism.sensitivities import (
@@ -391,7 +391,7 @@ def likelihood_equations(
         parts = coordinates.parts(e / scale, J / scale[:, None], seen)
         H, g = curvature(parts, coordinates.size), np.zeros(coordinates.size)
         for part in parts:
-            g[part.columns] += part.J.reshape(-1, len(part.columns)).T @ part.e.ravel()
+            g[part.columns] += flattened(part.J).T @ part.e.ravel()
     inner = np.arange(coordinates.size) >= coordinates.shared
     for r in range(len(e)):
         inner[coordinates.local_columns(r)] = False

@@ -45,6 +45,8 @@ class FitOptions:
         restarts: Largest number of restarts.
         bend: Size of an error in each channel beyond which errors counted linearly [unit of the channel];
             None if all errors counted by their square.
+        ranges: Least and largest unconstrained value of each parameter. They depend on the start of the fit,
+            see `physical_ranges`; None to derive them from the fitted model.
     """
 
     process_noise: dict[str, float] | None = None
@@ -54,6 +56,7 @@ class FitOptions:
     max_steps: int = 60
     restarts: int = 8
     bend: tuple[float, ...] | None = None
+    ranges: tuple[tuple[float, ...], tuple[float, ...]] | None = None
 
 
 @dataclasses.dataclass(frozen=True)

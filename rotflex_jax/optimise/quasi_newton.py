@@ -123,8 +123,10 @@ def descend(
             if not search.done:
                 search.receive(float(value), np.asarray(slope))
         found = [p for p in searches if p.x is not None]
+        if not found:  # the same points would be tried again
+            break
         for search in searches:
-            if search.x is None and found:
+            if search.x is None:
                 target = min(found, key=lambda p: p.f).x
                 assert target is not None
                 search.trial = 0.5 * (search.trial + target)

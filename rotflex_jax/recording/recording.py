@@ -5,7 +5,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from jaxtyping import Float
@@ -109,6 +109,8 @@ class Recording:
     constants: Mapping[str, float]
     remarks: tuple[Finding, ...]
     signals: Mapping[str, Float[np.ndarray, " N"]]
+    # The recording from which `slice` and `decimate` made this one, so that parts of one run are known.
+    _whole: ClassVar["Recording | None"] = None
 
     def __init__(
         self,
@@ -244,7 +246,7 @@ class Recording:
                 f"but was asked from {shown(i)} to {shown(j)}; choose 0 <= i < j <= {self.N}."
             )
         i, j = int(i), int(j)
-        return replace(
+        part = replace(
             self,
             u=self.u[i:j],
             y=self.y[i:j],
@@ -255,6 +257,12 @@ class Recording:
             # A single sample is no recording that could be continued.
             continues=self.slice(0, i) if i > 1 else self.continues if not i else None,
         )
+        return self._made(part)
+
+    def _made(self, part: "Recording") -> "Recording":
+        """A recording that was made from this one, marked as a part of the same run."""
+        object.__setattr__(part, "_whole", self._whole or self)
+        return part
 
     def split(
         self, share: float | None = None, *, seconds: float | None = None
@@ -290,6 +298,7 @@ class Recording:
         The mean keeps the impulse of the held input, to first order in `k Ts`. The output is not
         filtered: a filter would have to be part of the model, and angles have almost no content
         above the new Nyquist frequency. Not for outputs with strong noise there, which is aliased.
+        Parts of a recording remain parts of one run.
 
         Args:
             k: factor; samples at the end that do not fill a group of k are left out.
@@ -301,11 +310,13 @@ class Recording:
                 "give for instance 2."
             )
         k = int(factor)
-        groups = self.N // k
+        groups, before = self.N // k, self.continues
+        if before is not None:  # its last group of samples ends where this recording begins
+            before = before.slice(before.N % k, before.N).decimate(k) if k <= before.N else None
         u, *acting = (
             x[: groups * k].reshape(groups, k).mean(axis=1) for x in (self.u, *self.signals.values())
         )
-        return replace(
+        fewer = replace(
             self,
             u=u,
             y=self.y[: groups * k : k],
@@ -313,7 +324,9 @@ class Recording:
             Ts=self.Ts * k,
             n_init=max(1, min(round(self.n_init / k), groups // 4)),
             accept=quality.ACCEPTABLE,
+            continues=before,
         )
+        return self._made(fewer)
 
     def with_signals(self, signals: Mapping[str, Any]) -> "Recording":
         """The recording with these signals in place of its own.
@@ -448,9 +461,9 @@ def _one_after_the_other(a: Recording, b: Recording) -> bool:
 def of_one_run(a: Recording, b: Recording) -> bool:
     """Whether two recordings are parts of one run, or the same one.
 
-    Parts that were cut from one recording have its beginning (`continues`). Two different runs may begin with
-    the same standstill, so the common beginning must have `FEWEST_MOVING` samples that differ from the sample
-    before.
+    The recordings from which they were made by `slice` and `decimate` are compared, from their beginning
+    (`continues`). Two different runs may begin with the same standstill, so the common beginning must have
+    `FEWEST_MOVING` samples that differ from the sample before.
     """
     first, second = (_beginning(r) for r in (a, b))
     N = min(first.N, second.N)
@@ -503,6 +516,7 @@ def _goes_on(a: Recording, b: Recording) -> bool:
 
 def _beginning(recording: Recording) -> Recording:
     """The first recording of a run."""
+    recording = recording._whole or recording
     while recording.continues is not None:
         recording = recording.continues
     return recording
