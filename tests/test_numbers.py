@@ -244,7 +244,8 @@ KNOWN = {
         ),
         **dict.fromkeys(["0.38", "0.28", "1.93", "0.61", "0.20"], "errors with one offset for both, by hand"),
         **dict.fromkeys(
-            ["0.52", "0.65", "2.4", "4.4", "2.2", "1.7", "0.62", "0.76"], "errors with friction of first seconds"
+            ["0.52", "0.65", "2.4", "4.4", "2.2", "1.7", "0.62", "0.76"],
+            "errors with friction of first seconds",
         ),
         **dict.fromkeys(["1.3", "1.4", "1.9", "0.13"], "errors with the best offset for A, by hand"),
         **dict.fromkeys(["0.0252", "0.0063", "0.0185", "0.0094"], "friction of both runs, by hand"),

@@ -56,7 +56,7 @@ def is_unexplained(horizons: Horizons, current: ValidatedHypothesis) -> bool:
     problem = horizons.prediction.problem
     if bool(np.any(best_window_rmse(current) > NEAR_FLOOR * problem.noise)):
         return True
-    return process_noise_gain(problem, current.hypothesis) > TORQUE_NATS
+    return not process_noise_gain(problem, current.hypothesis) <= TORQUE_NATS  # so too if it is not finite
 
 
 def best_candidates(prediction: ScoreTest, free_run: ScoreTest, most: int) -> list[EffectLocation]:

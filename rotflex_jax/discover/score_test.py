@@ -402,7 +402,7 @@ def promising_at_both(prediction: list[Score], free_run: list[Score], most: int)
     always among them.
     """
     both = (prediction, free_run)
-    worth = [promising(listed, len(listed)) for listed in both]
+    worth = [promising(listed) for listed in both]
     highest = [max((s.nats for s in listed), default=1.0) for listed in worth]
     share: dict[EffectLocation, float] = {}
     for listed, best in zip(worth, highest, strict=True):
@@ -415,7 +415,7 @@ def promising_at_both(prediction: list[Score], free_run: list[Score], most: int)
     return [(first[p], second[p]) for p in dict.fromkeys(chosen)]
 
 
-def promising(listed: list[Score], most: int) -> list[Score]:
+def promising(listed: list[Score]) -> list[Score]:
     """Scores of candidates worth a refit, best first.
 
     A richer effect that gains nothing to first order over the simpler effect that it contains is left out,
@@ -429,4 +429,4 @@ def promising(listed: list[Score], most: int) -> list[Score]:
         simpler = [gains[c] for c in contained if c in gains]
         if all(s.start.expected_gain > g + 1.0 for g in simpler):
             worth.append(s)
-    return worth[:most]
+    return worth

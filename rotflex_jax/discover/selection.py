@@ -418,7 +418,7 @@ def replaced_by(
     """
     share: dict[EffectLocation, float] = {}
     for listed, later in zip(before, after, strict=True):
-        worth = promising(listed, len(listed))
+        worth = promising(listed)
         left = {s.location: s.nats for s in later}
         for s in worth:
             if left.get(s.location, 0.0) < REPLACED_LEFT * s.nats:

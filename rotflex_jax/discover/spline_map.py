@@ -10,7 +10,7 @@ import scipy
 from jaxtyping import Float, Int, Real
 
 from rotflex_jax.discover.hypothesis import Hypothesis
-from rotflex_jax.discover.likelihood import LikelihoodProblem, choose_process_noise
+from rotflex_jax.discover.likelihood import LikelihoodProblem, choose_process_noise, in_blocks
 from rotflex_jax.effects.learned import LearnedTorque
 from rotflex_jax.fit.coordinates import FitCoordinates
 from rotflex_jax.optimise.damped_least_squares import NormalEquations, Rules, after_trial, begin
@@ -25,9 +25,6 @@ STEPS_PER_NOISE, NOISE_CHOICES = 6, 3
 # Largest smoothness, and smoothness beyond which a map counts as flat, as multiples of the smallest one,
 # which allows weights as large as the torque of the motor.
 MAX_SMOOTHNESS, FLAT_SMOOTHNESS = 1e7, 1e6
-# Neighbouring samples are correlated; gradients of the likelihood count as independent between stretches of
-# this length [s].
-INDEPENDENT_SECONDS = 0.5
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,10 +70,9 @@ def map_equations(problem: LikelihoodProblem, h: Hypothesis, weights: list[int])
     H, g = FitCoordinates.of(h, problem.windows).sums(w, W)
     own = np.array([h.free.index(i) for i in weights])
     rest = np.setdiff1d(np.arange(len(g)), own)
-    width = max(round(INDEPENDENT_SECONDS / float(problem.dataset.data.Ts[0])), 1)
-    edges = np.arange(0, w.shape[1], width)
-    stretches = np.add.reduceat(np.sum(W[own] * w[None], axis=-1), edges, axis=-1)
-    scatter = np.sum(stretches**2, axis=(1, 2)) / np.maximum(np.diag(H)[own], 1e-300)
+    # Neighbouring samples are correlated: gradients of the likelihood count as independent between blocks.
+    blocks = [in_blocks(slopes, problem.dataset.data) for slopes in np.sum(W[own] * w[None], axis=-1)]
+    scatter = np.sum(np.square(blocks), axis=1) / np.maximum(np.diag(H)[own], 1e-300)
     observed = np.diag(H)[own] > 1e-6 * np.diag(H)[own].max()
     return MapEquations(
         H,

@@ -79,22 +79,25 @@ def squared_error(R: Float[np.ndarray, "K columns"], w: Float[np.ndarray, " P"])
     return float(np.sum((R[:, -1] - R[:, :-1] @ w) ** 2))
 
 
+# Number of ridges that a cross-validation tries, from the level of rounding to the mean eigenvalue.
+RIDGES = 31
+
+
 def cross_validated_ridge(
-    parts: list[Float[np.ndarray, "K K"]], count: int = 31
+    parts: list[Float[np.ndarray, "K K"]],
 ) -> tuple[float, Float[np.ndarray, " G"]]:
     """The ridge with the least error on blocks left out in turn.
 
     Args:
         parts: Triangular factor of each block.
-        count: Number of ridges to try, from the level of rounding to the mean eigenvalue.
 
     Returns:
         The best ridge, and all ridges that were tried.
     """
     P = parts[0].shape[1] - 1
     power = sum(np.sum(R[:, :-1] ** 2) for R in parts) / P
-    ridges = power * np.logspace(-14, 0, count)
-    errors = np.zeros(count)
+    ridges = power * np.logspace(-14, 0, RIDGES)
+    errors = np.zeros(RIDGES)
     for k, held in enumerate(parts):
         R = factor(np.concatenate([p for j, p in enumerate(parts) if j != k]))
         # One decomposition gives the weights of all ridges, as columns.

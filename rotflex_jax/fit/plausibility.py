@@ -17,11 +17,14 @@ from rotflex_jax.parameters import Estimate, Transform, specifications
 from rotflex_jax.recording import Recording
 from rotflex_jax.recording.smoothing import smoothed
 
+# Length over which measured outputs are smoothed [s].
+SMOOTHED_SECONDS = 0.03
+
 
 def motion(
-    mechanism: Mechanism, y: Float[np.ndarray, "N C"], Ts: float, smooth: float = 0.03
+    mechanism: Mechanism, y: Float[np.ndarray, "N C"], Ts: float
 ) -> dict[str, tuple[Float[np.ndarray, " N"], Float[np.ndarray, " N"]]]:
-    """Port -> (position, speed) by smoothing measured outputs over `smooth` seconds.
+    """Port -> (position, speed) by smoothing measured outputs over `SMOOTHED_SECONDS`.
 
     Ports that the measured positions do not determine are left out.
     """
@@ -30,7 +33,7 @@ def motion(
     is_position = np.array([q.is_position for q in mechanism.quantities])
     if not is_position.any():
         return {}
-    width = max(2 * round(smooth / Ts / 2) + 1, 5)
+    width = max(2 * round(SMOOTHED_SECONDS / Ts / 2) + 1, 5)
     width = min(width, len(y) - 1 + len(y) % 2)
     C = rows[is_position, : layout.n]
     position, speed = (
@@ -53,8 +56,8 @@ def physical_ranges(m: Mechanism) -> tuple[Float[np.ndarray, " P"], Float[np.nda
 
     They are the physical ranges that effects declare. A damping coefficient may fall below its own range by
     the damping of other effects at the same port. Then it corrects them, for instance a trusted back-EMF
-    constant that is too large, and the total damping remains physical. If a start is outside of a range, the
-    range is widened.
+    constant that is too large. The total damping remains physical as long as the other effects keep the
+    damping that they have at the start. If a start is outside of a range, the range is widened.
 
     Args:
         m: Mechanism with the values at the start.

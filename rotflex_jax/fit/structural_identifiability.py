@@ -135,21 +135,22 @@ def direction(
     )
 
 
-def least_held(
-    names: Sequence[str], vectors: Float[np.ndarray, "K P"], most: int = 400
-) -> tuple[tuple[str, ...], ...]:
+# Largest number of sets of parameters that `least_held` examines.
+MOST_SETS = 400
+
+
+def least_held(names: Sequence[str], vectors: Float[np.ndarray, "K P"]) -> tuple[tuple[str, ...], ...]:
     """The smallest sets of parameters that make all others identifiable if they are held.
 
     Args:
         names: Names of the parameters.
         vectors: Directions that are unknown.
-        most: Largest number of sets that are examined.
     """
     K = len(vectors)
     if not K:
         return ()
     inside = [i for i in range(len(names)) if np.abs(vectors[:, i]).max() > ZERO]
-    sets = itertools.islice(itertools.combinations(inside, K), most)
+    sets = itertools.islice(itertools.combinations(inside, K), MOST_SETS)
     return tuple(
         tuple(names[i] for i in chosen)
         for chosen in sets
