@@ -326,17 +326,27 @@ def test_a_limit_is_stood_at_unusually_often(samples: int, held: int, often: int
     free = np.repeat(np.random.default_rng(0).uniform(-1, 1, samples // held), held)
     for count, found in ((often - 1, False), (often, True)):
         u = free.copy()
-        u[:count] = 2.0 * end
+        u[: count - 1] = u[samples // 2] = 2.0 * end
         assert is_clipped(u) == found
     u = np.abs(free) + 0.5 if end > 0 else -np.abs(free) - 0.5
     u[:often] = 0.0  # a voltage of zero is not a limit
     assert not is_clipped(u)
 
 
+@pytest.mark.parametrize(("share", "found"), [(0.09, False), (0.11, True)])
+def test_an_input_that_stands_still_once_is_not_clipped(share: float, found: bool) -> None:
+    """A part of a recording may begin where friction holds the machine, and the controller its voltage."""
+    u = np.random.default_rng(0).uniform(-1, 1, 2000)
+    u[300:700] = -1.0
+    assert not is_clipped(u) and not is_clipped(u[300:])
+    u[450:500] = u.max() * share - (1 - share)  # a share of the range away, then back
+    assert is_clipped(u) == found
+
+
 @pytest.mark.parametrize(("levels", "found"), [(9, False), (10, True)])
 def test_an_input_of_a_few_levels_is_not_clipped(levels: int, found: bool) -> None:
     u = np.append(np.arange(1.0, levels), np.full(200, float(levels)))
-    assert is_clipped(np.append(u, np.tile(u[: levels - 1], 10))) == found
+    assert is_clipped(np.append(u, np.tile(u[:levels], 10))) == found
 
 
 def test_whole_numbers_over_twenty_are_counts() -> None:

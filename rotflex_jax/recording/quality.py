@@ -447,9 +447,15 @@ def _of_input(u: Float[np.ndarray, " N"], name: str, unit: str) -> list[Finding]
         return [Finding("constant_input", name, message, "error")]
     found = []
     levels, counts = np.unique(u, return_counts=True)
-    # A two-level or stepped input holds every level for a long time; a clipped input only the extremes.
+    # A two-level or stepped input holds every level for a long time; a clipped input only the extremes, and
+    # it comes back to them. A controller with a constant error, as where friction holds the machine, may
+    # stand once at what is the extreme of a part of a recording.
     often = max(5.0, 0.005 * len(u), 5.0 * float(np.median(counts)))
-    ends = [f"{levels[k]:g}" for k in (0, -1) if counts[k] >= often and levels[k] != 0]
+    ends = [
+        f"{levels[k]:g}"
+        for k in (0, -1)
+        if counts[k] >= often and levels[k] != 0 and _comes_back(u, float(levels[k]))
+    ]
     if len(levels) >= 10 and ends:
         message = (
             f"Input {name!r} stands at its limit, {' and '.join(ends)} {unit}, unusually often: "
@@ -463,6 +469,13 @@ def _of_input(u: Float[np.ndarray, " N"], name: str, unit: str) -> list[Finding]
         )
         found.append(Finding("units", name, message, "warning"))
     return found
+
+
+def _comes_back(u: Float[np.ndarray, " N"], level: float) -> bool:
+    """Whether the input is at a level more than once, and in between a tenth of its range away from it."""
+    there, away = u == level, np.abs(u - level) > 0.1 * np.ptp(u)
+    visits = there[there | away].astype(int)
+    return int(np.sum(np.diff(visits, prepend=0) == 1)) > 1
 
 
 def _quantised(name: str, unit: str, step: float | None) -> Finding | None:
