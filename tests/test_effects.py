@@ -376,15 +376,44 @@ def test_sentence_is_for_people(cls):
 @pytest.mark.parametrize(
     ("level", "damping", "says", "does_not_say"),
     [
-        (0.02, 0.0, ["sticks up to 0.03 N m", "slides at 0.02 N m"], "damps"),
-        (0.02, 0.05, ["sticks up to 0.03 N m", "damps motion below 0.4 rad/s by 0.05 N m s/rad"], "without"),
-        (1e-11, 0.05, ["without a level", "damps motion below 0.4 rad/s by 0.05 N m s/rad"], "sticks"),
-        (0.0, 0.0, ["sticks up to 0 N m"], "damps"),
+        (0.02, 0.0, ["Coulomb level of 0.02 N m", "breakaway level of 0.03 N m"], "damping"),
+        (0.02, 0.05, ["breakaway level of 0.03 N m", "damping 0.05 N m s/rad below 0.4 rad/s"], "without"),
+        (1e-11, 0.05, ["without a Coulomb level", "damping 0.05 N m s/rad below 0.4 rad/s"], "breakaway"),
+        (0.0, 0.0, ["Coulomb level of 0 N m"], "damping"),
     ],
 )
 def test_lugre_friction_speaks_of_what_it_does(level, damping, says, does_not_say):
     said = CATALOG["lugre"]("hub", level, rise=0.5, slow=0.4, presliding=0.003, damping=damping).sentence()
     assert all(part in said for part in [*says, "0.003 rad (0.17 degrees)"]) and does_not_say not in said
+
+
+def test_a_level_is_named_where_the_rise_is_lost_beyond_all_speeds():
+    """The torque of the bristles at `slow` is then no measure: the hub never turns so fast."""
+    said = CATALOG["lugre"]("hub", 0.035, rise=0.0, slow=54.7, presliding=0.0013, damping=0.89).sentence()
+    assert said == (
+        "friction of the hub with a Coulomb level of 0.035 N m, which builds up over 0.0013 rad "
+        "(0.074 degrees) after each reversal; presliding damping 0.89 N m s/rad below 55 rad/s"
+    )
+
+
+@pytest.mark.parametrize(
+    ("beta", "says"),
+    [
+        (0.5, "the hub has a hysteretic torque of up to 0.07 N m"),
+        (0.03, "; beta = 0.03: hardly any hysteresis"),
+        (
+            1e-11,
+            "a spring at the hub that saturates at 0.07 N m over 0.43 rad (25 degrees); beta = 0: no hys",
+        ),
+    ],
+)
+def test_bouc_wen_without_a_hysteretic_part_is_called_a_spring(beta, says):
+    assert says in CATALOG["bouc_wen"]("hub", 0.07, width=0.43, beta=beta).sentence()
+
+
+@pytest.mark.parametrize(("offset", "says"), [(0.175, "0.175 V above"), (-0.02, "0.02 V below")])
+def test_an_offset_says_on_which_side_of_the_command_the_voltage_is(offset, says):
+    assert CATALOG["voltage_offset"]("input", offset).sentence() == f"the motor voltage is {says} the command"
 
 
 @every_effect

@@ -173,7 +173,8 @@ class VoltageOffset(Actuation):
 
     def sentence(self) -> str:
         """The effect with its values, in one sentence."""
-        return f"the motor sees {self.offset:+.3g} V more than was commanded"
+        side = "below" if self.offset < 0 else "above"
+        return f"the motor voltage is {abs(self.offset):.3g} V {side} the command"
 
 
 @register

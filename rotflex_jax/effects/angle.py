@@ -77,7 +77,7 @@ class Cogging(Force):
         at: Port.
         sine: Amplitude of the sine [N m].
         cosine: Amplitude of the cosine [N m].
-        periods: Repetitions per turn of the port [-].
+        periods: Repetitions of the torque [per turn of the port].
 
     Source: D. Hanselman, Brushless Permanent Magnet Motor Design, 2nd ed., 2003, chapter 4.
     """
@@ -95,7 +95,7 @@ class Cogging(Force):
 
     sine: float = parameter(0.0, unit="N m", typical=0.02, meaning="amplitude of the sine")
     cosine: float = parameter(0.0, unit="N m", typical=0.02, meaning="amplitude of the cosine")
-    periods: float = parameter(8.0, unit="", lower=0.1, meaning="repetitions per turn")
+    periods: float = parameter(8.0, unit="per turn", lower=0.1, meaning="repetitions")
 
     def force(self, position: Scalar, speed: Scalar, voltage: Scalar) -> Scalar:
         """Torque [N m] on the port."""

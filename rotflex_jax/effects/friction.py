@@ -48,9 +48,7 @@ class Coulomb(DryFriction):
 
     def sentence(self) -> str:
         """The effect with its values, in one sentence."""
-        return (
-            f"the {self.at} meets a constant friction torque of {self.level:.3g} N m whichever way it turns"
-        )
+        return f"Coulomb friction of {self.level:.3g} N m at the {self.at}"
 
 
 @register
@@ -101,7 +99,7 @@ class CoulombAsymmetric(DryFriction):
     def sentence(self) -> str:
         """The effect with its values, in one sentence."""
         return (
-            f"the {self.at} meets a friction torque of {self.forward:.3g} N m turning forwards and "
+            f"Coulomb friction at the {self.at} of {self.forward:.3g} N m turning forwards and "
             f"{self.backward:.3g} N m turning backwards"
         )
 

@@ -9,6 +9,9 @@ import jax.numpy as jnp
 from rotflex_jax.effects.base import DRY_FRICTION, Memory, Probe, Scalar, Scale, register
 from rotflex_jax.parameters import parameter
 
+# Share of the hysteretic part below which a sentence calls Bouc-Wen hysteresis a spring.
+LEAST_HYSTERETIC = 0.05
+
 
 @register
 @dataclasses.dataclass(frozen=True)
@@ -63,7 +66,7 @@ class Dahl(Memory):
     def sentence(self) -> str:
         """The effect with its values, in one sentence."""
         return (
-            f"the {self.at} meets a friction torque of {self.level:.3g} N m that builds up over "
+            f"a friction torque of {self.level:.3g} N m at the {self.at} that builds up over "
             f"{self.presliding:.2g} rad ({math.degrees(self.presliding):.2g} degrees) after each "
             "reversal"
         )
@@ -157,16 +160,17 @@ class LuGre(Memory):
 
     def sentence(self) -> str:
         """A sentence about the friction, the damping of the bristles or both, without a negligible one."""
-        within = f"{self.presliding:.2g} rad ({math.degrees(self.presliding):.2g} degrees)"
         breakaway, bristles = self.level * (1 + self.rise), self.damping * self.slow  # torques [N m]
-        damps = f"damps motion below {self.slow:.2g} rad/s by {self.damping:.3g} N m s/rad"
-        if breakaway < 1e-3 * bristles:
-            return f"friction of the {self.at} without a level {damps}, over {within} after each reversal"
-        sticks = (
-            f"the {self.at} sticks up to {breakaway:.3g} N m and slides at {self.level:.3g} N m, "
-            f"its friction building up over {within}"
-        )
-        return sticks if bristles <= 1e-3 * breakaway else f"{sticks}; meanwhile it {damps}"
+        # `slow` may be far above the speeds that occur, so only a rounding error of a fit is no level.
+        has_level = breakaway > 1e-6 * bristles or not bristles
+        levels = f"with a Coulomb level of {self.level:.3g} N m" if has_level else "without a Coulomb level"
+        if has_level and f"{breakaway:.3g}" != f"{self.level:.3g}":
+            levels += f" and a breakaway level of {breakaway:.3g} N m"
+        damps = f"; presliding damping {self.damping:.3g} N m s/rad below {self.slow:.2g} rad/s"
+        return (
+            f"friction of the {self.at} {levels}, which builds up over {self.presliding:.2g} rad "
+            f"({math.degrees(self.presliding):.2g} degrees) after each reversal"
+        ) + (damps if bristles > 1e-3 * breakaway else "")
 
 
 @register
@@ -227,8 +231,14 @@ class BoucWen(Memory):
         return [[{"level": torque, "width": width, "beta": 0.5}] for width in widths]
 
     def sentence(self) -> str:
-        """The effect with its values, in one sentence."""
+        """The effect with its values, in one sentence; without a hysteretic part it is a spring."""
+        width = f"{self.width:.2g} rad ({math.degrees(self.width):.2g} degrees)"
+        if self.beta < LEAST_HYSTERETIC:
+            return (
+                f"a spring at the {self.at} that saturates at {self.level:.3g} N m over {width}; "
+                f"beta = {round(self.beta, 2):g}: {'hardly any' if self.beta >= 0.005 else 'no'} hysteresis"
+            )
         return (
             f"the {self.at} has a hysteretic torque of up to {self.level:.3g} N m that builds up over "
-            f"{self.width:.2g} rad ({math.degrees(self.width):.2g} degrees) after each reversal"
+            f"{width} after each reversal"
         )

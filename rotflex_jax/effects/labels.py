@@ -65,7 +65,9 @@ def effect_title(effect: str) -> str:
 
 # What may precede the name of an effect in a list. After any other word, "spring" or "delay" is an
 # ordinary word.
-_BEFORE_A_NAME = re.compile(r"(?:^|[^\w\s]\s*|\b(?:and|or|from|refitting|scoring)\s)$")
+_BEFORE_A_NAME = re.compile(
+    r"(?:^\s*|[^\w\s]\s*|\b(?:and|or|from|fitting|refitting|scoring|without|instead of)\s)$"
+)
 
 
 def with_titles(text: str) -> str:
@@ -75,6 +77,8 @@ def with_titles(text: str) -> str:
     ('+ Coulomb friction at hub', 'LuGre friction at the hub and input delay')
     >>> with_titles("cubic spring at the joint"), with_titles("the spring at the joint hardens")
     ('cubic spring at the joint', 'the spring at the joint hardens')
+    >>> with_titles("  lugre at hub instead of coulomb at hub")
+    '  LuGre friction at hub instead of Coulomb friction at hub'
     """
 
     def noun(found: re.Match[str]) -> str:

@@ -254,7 +254,7 @@ def beyond_recordings(m: Mechanism, reach: Reach, effects: Iterable[Effect] | No
             elif name == effect.repeats and value * reach.position.get(effect.at, np.inf) < HALF_A_PERIOD:
                 travel = math.degrees(2 * reach.position[effect.at])
                 why = (
-                    f"per turn is less than half a period within the motion of {effect.at} ({travel:.3g} "
+                    f"is less than half a period within the motion of {effect.at} ({travel:.3g} "
                     "degrees), where the law is a spring or a constant torque"
                 )
             else:

@@ -90,8 +90,8 @@ class Units(NamedTuple):
             text: Sentence of the effect.
             of_input: Whether the volts in it stand for the unit of the input.
 
-        >>> Units("m", "N").sentence("the axis meets a torque of 20 N m whichever way it turns")
-        'the axis meets a force of 20 N whichever way it moves'
+        >>> Units("m", "N").sentence("the axis has a torque of 20 N m and turns by 0.1 rad (6 degrees)")
+        'the axis has a force of 20 N and moves by 0.1 m'
         >>> Units(input="rad").sentence("voltages between -0.1 V and 0.2 V have no effect", of_input=True)
         'inputs between -0.1 rad and 0.2 rad have no effect'
         """
