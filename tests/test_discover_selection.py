@@ -20,6 +20,7 @@ from rotflex_jax.discover.selection import (
     choose,
     describe,
     distinguished,
+    gains_in_words,
     helps,
     horizon_gains,
     paired_gain,
@@ -403,7 +404,7 @@ def test_runs_that_diverge_are_worse_than_all_others() -> None:
     assert not admissible(both, FAR, MEASURED, NOISE)
     assert not runs_clearly_better(both.window_rmse, both.window_rmse)
     assert runs_clearly_better(steady.window_rmse, both.window_rmse)
-    assert "free runs diverge; fitted to free runs they diverge" in describe(both, FAR)
+    assert "free runs diverge; fitted to free runs: free runs diverge" in describe(both, FAR)
 
 
 def test_of_two_that_nothing_distinguishes_the_one_with_fewer_parameters_leads():
@@ -703,17 +704,18 @@ def test_gains_at_both_horizons_are_told_with_their_certainty() -> None:
     assert runs is not None
     assert prediction == pytest.approx((40.0, 4.0, 0.5, 60.0))
     assert runs == pytest.approx((20.0, 5.0, 0.25, 30.0))
-    said = "coulomb at the hub: 40 nats on validation data (z 4.0), 60 on training data (z 6.0), "
+    said = "log-likelihood of validation data +40 nat (z 4.0), of training data +60 nat (z 6.0), "
     said += "free-run error 0.5 times as large"
-    more = "; fitted to free runs 0.25 times (z 5.0, training 7.5)"
-    assert describe(candidate, before).endswith(said.partition(": ")[2] + more)
+    more = "; fitted to free runs: free-run error 0.25 times as large (z 5.0, of training data 7.5)"
+    assert gains_in_words(candidate, before) == said + more
+    assert describe(candidate, before) == f"coulomb at hub: {said}{more}"
     # If one of the two was fitted to predictions alone, only predictions are reported.
     for pair in (
         (dataclasses.replace(candidate, free_run=None), before),
         (candidate, dataclasses.replace(before, free_run=None)),
     ):
         assert horizon_gains(*pair) == (prediction, None)
-        assert describe(*pair).endswith(said.partition(": ")[2])
+        assert gains_in_words(*pair) == said
 
 
 def test_shares_of_the_most_add_up_over_the_horizons() -> None:

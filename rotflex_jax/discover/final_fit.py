@@ -320,7 +320,7 @@ class _FinalFitBuilder:
         state, structure = self.state, candidate.tried.structure
         laws = laws_in_question(state, location, structure.on)
         if laws:
-            state.say(f"  in the place of {location}: {', '.join(map(str, laws))}")
+            state.say(f"  {' or '.join(map(str, laws))} instead of {location}")
         fits = fit_structures([(candidate.tried.fits[0].with_law(law), self.recordings) for law in laws])
         better = [
             (other, law)

@@ -223,7 +223,7 @@ def _refit_replaced(
     locations = replaced_by(winner.location, before, after, tried)
     if not locations:
         return []
-    state.say("refitting what it may stand for: " + ", ".join(map(str, locations)))
+    state.say("refitting effects that are similar to it: " + ", ".join(map(str, locations)))
     beside, scores, *starts = Promising.at(state.origin, before, locations)
     more = refit_and_validate(state, beside, *starts)
     for candidate in more:

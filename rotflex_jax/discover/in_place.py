@@ -17,7 +17,7 @@ from rotflex_jax.discover.hypothesis import parameter_count, usual_start, withou
 from rotflex_jax.discover.search_state import SearchState
 from rotflex_jax.discover.selection import (
     better_in_place,
-    describe,
+    gains_in_words,
     predictions_apart,
     shares_of_gain,
     undecided,
@@ -73,7 +73,7 @@ def take_better_laws(state: SearchState) -> tuple[str, ...]:
             continue
         best = better[int(np.argmax(shares_of_gain(better, known)))]
         assert best.location
-        state.say(f"  + {best.location} in the place of {location}, " + describe(best, known))
+        state.say(f"  {best.location} instead of {location}: " + gains_in_words(best, known))
         state.replace(location, best)
         predictions = predictions_apart(best, known)
         why = (
@@ -124,7 +124,7 @@ def undecided_rivals(state: SearchState) -> dict[EffectLocation, list[EffectLoca
         known = _as_found(state, location)
         fitted = _in_place(state, location, [p for p in rivals if not CATALOG[p.effect].line])
         for rival in fitted:
-            state.say(f"  in the place of {location}, " + describe(rival, final))
+            state.say(f"  {rival.location} instead of {location}: " + gains_in_words(rival, final))
         # A periodic disturbance remains a rival without a test: it was refitted at its frequency in its
         # round.
         remaining[location] = [p for p in rivals if CATALOG[p.effect].line]
@@ -154,7 +154,7 @@ def _in_place(
     )
     fitted = []
     if starts:
-        state.say(f"  fitting {', '.join(str(c.location) for c in starts)} in the place of {location}")
+        state.say(f"  fitting {', '.join(str(c.location) for c in starts)} instead of {location}")
         fitted = refit_and_validate(state, less, starts, starts)
     counts = {r: parameter_count(s, v.hypothesis, r) for r, v in known.items()}
     return [

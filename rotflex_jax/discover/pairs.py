@@ -30,8 +30,8 @@ from rotflex_jax.discover.selection import (
     TRAIN_NATS,
     admissible,
     best_window_rmse,
-    describe,
     distinguished,
+    gains_in_words,
     likelier_of_each,
     predictions_apart,
     shares_at_each,
@@ -245,7 +245,8 @@ def pairs_passed_by(
     others = [pair for pair in passed if frozenset(pair[0].locations) not in fitted]
     if len(effects) < 2 or not others:
         return [], []
-    say("pairs of the start that were not found: " + ", ".join(_named(a.locations) for a, _ in others))
+    named = ", ".join(_named(a.locations) for a, _ in others)
+    say(f"testing pairs of effects that single steps did not find: {named}")
     grown = refit_pairs(horizons.prediction.problem, beside.hypothesis, [a for a, _ in others])
     predictions = on_threads(lambda h: validate(horizons.prediction.validation, h, beside), grown)
     tried: dict[Pair, ValidatedHypothesis] = {}
@@ -267,7 +268,7 @@ def _say_gains(
 ) -> None:
     """Report a line of progress for each pair, with its gains over a model."""
     for pair, v in tried.items():
-        say(f"  {_named(pair)}: " + describe(v, over).removeprefix("None: "))
+        say(f"  {_named(pair)}: " + gains_in_words(v, over))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -99,30 +99,37 @@ def helps(gain: HorizonGain) -> bool:
 
 
 def describe(candidate: ValidatedHypothesis, current: ValidatedHypothesis) -> str:
-    """The gains of a candidate, in one line of progress."""
+    """A candidate with its gains, in one line of progress."""
+    return f"{candidate.location}: {gains_in_words(candidate, current)}"
+
+
+def gains_in_words(candidate: ValidatedHypothesis, current: ValidatedHypothesis) -> str:
+    """The gains of a candidate over a model, at both horizons, in words."""
     nats, z = paired_gain(candidate.blocks, current.blocks)
     train, train_z = _training_gain(candidate, current)
     ratio = float(np.exp(_log_error_ratio(candidate, current)))
     line = (
-        f"{candidate.location}: {nats:.0f} nats on validation data (z {z:.1f}), {train:.0f} "
-        f"on training data (z {train_z:.1f}), {error_ratio(ratio)}"
+        f"log-likelihood of validation data {nats:+.0f} nat (z {z:.1f}), of training data {train:+.0f} nat "
+        f"(z {train_z:.1f}), {error_ratio(ratio)}"
     )
     runs, before = candidate.free_run, current.free_run
     if runs is None or before is None:
         return line
     z, train_z = paired_gain(runs.blocks, before.blocks)[1], _training_gain(runs, before)[1]
     ratio = float(np.exp(_log_error_ratio(runs, before)))
-    fitted = f"{ratio:.2g} times" if np.isfinite(ratio) else "they diverge"
-    return f"{line}; fitted to free runs {fitted} (z {z:.1f}, training {train_z:.1f})"
+    return f"{line}; fitted to free runs: {error_ratio(ratio)} (z {z:.1f}, of training data {train_z:.1f})"
 
 
 def error_ratio(ratio: float) -> str:
     """How a free-run error compares with the one before.
 
-    >>> error_ratio(1.87), error_ratio(0.534), error_ratio(float("inf"))
-    ('free-run error 1.9 times as large', 'free-run error 0.53 times as large', 'free runs diverge')
+    >>> error_ratio(1.87), error_ratio(1.002), error_ratio(float("inf"))
+    ('free-run error 1.9 times as large', 'free-run error unchanged', 'free runs diverge')
     """
-    return f"free-run error {ratio:.2g} times as large" if np.isfinite(ratio) else "free runs diverge"
+    if not np.isfinite(ratio):
+        return "free runs diverge"
+    times = f"{ratio:.2g}"
+    return "free-run error unchanged" if times == "1" else f"free-run error {times} times as large"
 
 
 def _training_gain(a: ValidatedHypothesis, b: ValidatedHypothesis) -> tuple[float, float]:

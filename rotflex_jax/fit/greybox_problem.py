@@ -451,7 +451,7 @@ class GreyBoxProblem:
             best = min((*ends, *more), key=lambda attempt: attempt.rank)
             if self._settled(best, [*ends, *more]):
                 break
-            self.say(f"fit: restart {number + 1} of at most {self.restarts}, cost so far {best.cost:.1f}")
+            self.say(f"fit: restart {number + 1} of at most {self.restarts}, cost so far {best.cost:.1f} nat")
             if number == 0 and len(way) > 1:
                 more.append(self.attempt(self._at_windows(start, way[0].windows), way))
             elif number % 2:
@@ -559,7 +559,7 @@ class GreyBoxProblem:
         coordinates = self.coordinates(point, stage.windows)
 
         def tell(progress: Progress) -> None:
-            self.say(f"fit: {progress.evaluations} steps, cost {progress.cost:.1f}")
+            self.say(f"fit: {progress.evaluations} steps, cost {progress.cost:.1f} nat")
 
         return minimise(
             lambda at: self.equations(at, stage, K),

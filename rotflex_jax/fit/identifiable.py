@@ -124,8 +124,11 @@ class Identifiability:
             worst = max(self.std, key=lambda n: self.std[n], default="")
             half = 100 * HALF_WIDTH_95
             tail = f"; worst is {worst}, ± {half * self.std[worst]:.2g} %" if worst else ""
-            least = f"± {half * BADLY_KNOWN:.0f} % or better"
-            return (*said, f"This recording determines every combination to {least}{tail}.")
+            return (
+                *said,
+                f"This recording determines every combination with a standard deviation of at most "
+                f"{100 * BADLY_KNOWN:.0f} % (95 %: ± {half * BADLY_KNOWN:.0f} %){tail}.",
+            )
         said += [f"{d.sentence}." for d in self.badly_known if np.isfinite(d.std)]
         if self.structural:
             for words, found in (

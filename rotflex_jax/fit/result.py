@@ -200,7 +200,9 @@ class Fit:
         )
 
     def __str__(self) -> str:
-        lines = [f"Fit: {self.ending}, cost {self.cost:.1f}"]
-        lines += [f"  residual {c}: {s:.3g} rms" for c, s in self.noise.items()]
+        lines = [f"Fit: {self.ending}, cost {self.cost:.1f} nat"]
+        for channel, own in output_units(self.model.mechanism).items():
+            value, unit = readable(self.noise[channel], own)
+            lines.append(f"  residual {channel}: {f'{value:.3g} {unit}'.rstrip()} rms")
         lines += [f"  {e}" for e in self.parameters]
         return "\n".join(lines + [f"  {remark.sentence}" for remark in self.remarks])

@@ -108,8 +108,9 @@ def latent_torque(
                 break
             linear = new
             intensity = estimator.maximise(linear, start, intensity, 10.0 if k else 1e3)
-            said = ", ".join(f"{p} {q:.2g}" for p, q in zip(chosen, intensity, strict=True))
-            say(f"latent torque: {said}")
+            unit = m.units.unit("(N m)^2/s")
+            said = ", ".join(f"{p} {q:.2g} {unit}" for p, q in zip(chosen, intensity, strict=True))
+            say(f"latent torque: intensity of its random walk {said}")
             S, std = estimator.smooth(linear, start, intensity)
             nats = estimator.gains(linear, start, intensity)
     return latent_torque_result(model, given, chosen, (S, std), intensity, nats, scale)
