@@ -45,8 +45,8 @@ simulated = rf.discover(rf.joints.paper(), train, test, progress=rf.live())
 simulated
 
 # %% [markdown]
-# The ranking is what the search saw before it added anything: how strongly the data ask for each effect,
-# in nats (ten are strong evidence). Laws of friction at the hub stand together on top, since they
+# The ranking is what the search saw before it added anything: how much likelier the data are with each
+# effect, in nats (ten are strong evidence). Laws of friction at the hub stand together on top, since they
 # resemble each other; refits and unseen data tell them apart.
 
 # %%

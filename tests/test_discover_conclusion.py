@@ -410,7 +410,10 @@ def test_a_sensor_of_unknown_noise_leaves_the_verdict_open() -> None:
     unknown = Assessment({}, {"theta": math.nan, "alpha": 1.0}, 0.0)
     assert not unknown.is_explained and "noise of theta is not known" in unknown.criterion
     worse = Assessment({}, {"theta": math.nan, "alpha": 7.0, "beta": 6.0}, 0.0)
-    assert "the error of alpha in short runs is above 1.5" in worse.criterion
+    assert worse.criterion == (
+        "errors of short free runs are theta an unknown number of, alpha 7.00, beta 6.00 times the sensor "
+        "noise (limit 1.5)"
+    )
     assert Assessment({}, {"theta": math.nan}, 0.0).grade is None
     assert "hardly likelier with a random torque" in Assessment({}, {"theta": 1.0}, 0.0).criterion
 
@@ -541,7 +544,8 @@ LOOK = (
     "look like other values of the fitted parameters here (to 99 %): a motion with more reversals, "
     "speeds and amplitudes tells them apart"
 )
-TORQUE = "predictions are likelier with a random torque (0.1 nat per measured value, at most 0.03)"
+TORQUE = "predictions are likelier with a random torque (0.1 nat per measured value, limit 0.03)"
+WITHIN = "errors of free runs over 2 s are within 1.5 times the sensor noise"
 
 
 @pytest.mark.parametrize(
@@ -569,7 +573,7 @@ TORQUE = "predictions are likelier with a random torque (0.1 nat per measured va
         ({"ratio": 3.0}, f"S{REMAINS[1:]}: {REACHED.replace('alpha 1.', 'alpha 3.')}."),
         (
             {"noise_nats": 0.1, "rounds": ((),)},
-            f"{FOUND} found, but {REMAINS}: {REACHED}; short runs are at the noise, but {TORQUE}{SHARE}.",
+            f"{FOUND} found, but {REMAINS}: {REACHED}; {WITHIN}, but {TORQUE}{SHARE}.",
         ),
         (
             {"excited": 1},

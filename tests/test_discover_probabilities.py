@@ -157,12 +157,30 @@ def test_what_is_told(found):
         {"effect": "sensor_bias", "port": "alpha"},
     ]
     assert data["effects"]["stribeck@hub"] == pytest.approx(2 / 7)
-    assert "3 sets" in found.sentence and "Coulomb friction at hub 55 %" in found.sentence
-    assert "Stribeck" in found.sentence and "none of these 4 %" in found.sentence
+    assert "3 sets" in found.sentence and "Coulomb friction at hub (the reported set) 55 %" in found.sentence
+    assert "Stribeck" in found.sentence and "; a set that was not fitted 4 %." in found.sentence
     left = probabilities([fitted("")], misfit=np.inf, rule=RULE)
     assert probabilities([fitted("")], misfit=2.0, rule=RULE).elsewhere == pytest.approx((0.04 + 0.25) / 2)
     assert left.elsewhere == 0.25 and "catalogue" in left.remarks[1]
-    assert left.sentence == "One set of effects was fitted: nothing more 75 %; another one 25 %."
+    assert left.sentence == (
+        "One set of effects was fitted: nothing more (the reported set) 75 %; a set that was not fitted 25 %."
+    )
+
+
+def test_the_reported_set_and_the_rest_are_named_too():
+    """An offset of the machine is in every set, so that alone it is no effect."""
+    offset = "voltage_offset@input"
+    names = ["", "coulomb@hub", "lag@input", "delay@input", "cogging@hub"]
+    sets = tuple(
+        SetProbability(frozenset([offset, *n.split()]), p)
+        for n, p in zip(names, (0.25, 0.21, 0.16, 0.12, 0.09), strict=True)
+    )
+    found = Probabilities(sets, {}, 0.17, evidence=(FittedSet(sets[3].effects),))
+    assert found.sentence == (
+        "Most probable of the 5 sets of effects that were fitted: nothing beside voltage offset 25 %; "
+        "Coulomb friction at hub + voltage offset 21 %; input lag + voltage offset 16 %; input delay + "
+        "voltage offset (the reported set) 12 %; the other fitted set 9 %; a set that was not fitted 17 %."
+    )
 
 
 def test_a_sentence_names_three_sets_at_most_and_none_below_a_hundredth():
@@ -172,12 +190,14 @@ def test_a_sentence_names_three_sets_at_most_and_none_below_a_hundredth():
         return Probabilities(sets, {}, 0.02).sentence
 
     assert told(0.968, 0.0101).endswith(
-        "Coulomb friction at hub 97 %; then input lag 1 %; none of these 2 %."
+        "Coulomb friction at hub 97 %; input lag 1 %; a set that was not fitted 2 %."
     )
-    assert told(0.970, 0.0099).endswith("Coulomb friction at hub 97 %; none of these 2 %.")
+    assert told(0.970, 0.0099).endswith(
+        "Coulomb friction at hub 97 %; the other fitted set < 1 %; a set that was not fitted 2 %."
+    )
     assert "delay" in told(0.5, 0.2, 0.15, 0.13) and "cogging" not in told(0.5, 0.2, 0.15, 0.13)
     # If all sets are unlikely, the first one is named.
-    assert "Coulomb friction at hub < 1 %; none" in told(0.009, 0.008)
+    assert "Coulomb friction at hub < 1 %; the other" in told(0.009, 0.008)
 
 
 def fit_of(*names: str, train=0.0, held_out=0.0, free_run=None):

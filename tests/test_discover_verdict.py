@@ -90,7 +90,7 @@ def test_sentence_tile_table_json_and_terminal_say_the_same_number(times, monkey
 def test_the_verdict_says_which_criterion_decided() -> None:
     by_error = ended(229.0)
     assert by_error.verdict is Verdict.UNEXPLAINED
-    assert "above 1.5 times the sensor noise" in by_error.assessment.criterion
+    assert "times the sensor noise (limit 1.5)" in by_error.assessment.criterion
     by_torque = ended(1.17, nats=2 * TORQUE_NATS)
     assert by_torque.verdict is Verdict.UNEXPLAINED
     assert "random torque (0.06 nat" in by_torque.sentence
@@ -161,15 +161,18 @@ def test_steps_are_said_once_and_no_nan_reaches_a_reader() -> None:
         for text in (str(fit), read(f"<div>{fit._repr_html_()}</div>").text):
             assert said in text
             assert text.count("60 steps") == 1
+            assert re.search(r"cost 1[.0]* nat", text)
             assert "nan" not in text
+        assert "  residual theta: 0.0573 deg rms\n" in str(fit)
 
 
 def test_a_parameter_without_an_interval_is_not_called_held(monkeypatch) -> None:
     monkeypatch.setattr("rotflex_jax.report.page.pictures", lambda *given: {})
     found = ended(3.0)
     lost = Estimate("hub.coulomb.level", 0.03, NAN, (NAN, NAN), "N m", note="not determined by these data")
-    first = dataclasses.replace(found.rounds[0], parameters={"level": lost})
-    text = read(render(dataclasses.replace(found, rounds=(first, *found.rounds[1:])))).text
+    estimates = tuple(lost if e.name == lost.name else e for e in found.final.estimates)
+    last = dataclasses.replace(found.rounds[-1], stage=dataclasses.replace(found.final, estimates=estimates))
+    text = read(render(dataclasses.replace(found, rounds=(*found.rounds[:-1], last)))).text
     assert "0.03 N m no interval" in text
     assert "0.03 N m held" not in text
 
@@ -184,7 +187,7 @@ def test_what_is_exactly_at_a_limit_of_the_end_is_beyond_it() -> None:
     assert (near, far) == (NEAR_FLOOR, FAR_FLOOR)
     assert (grade(near), grade(far)) == (Grade.NEAR, Grade.FAR)
     end = Assessment({"theta": 0.5}, {"theta": near}, 0.0)
-    assert not end.at_noise and "above 1.5 times the sensor noise" in end.criterion
+    assert not end.at_noise and end.criterion.endswith("theta 1.50 times the sensor noise (limit 1.5)")
     assert end.explained_text == "theta 0.5 % of the baseline's squared error is explained"
     below = dataclasses.replace(end, remaining={"theta": np.nextafter(near, 0)})
     assert below.at_noise and below.is_explained
@@ -195,7 +198,7 @@ def test_what_is_exactly_at_a_limit_of_the_end_is_beyond_it() -> None:
         "noise of alpha is not known"
         in dataclasses.replace(below, remaining=below.remaining | unknown).criterion
     )
-    assert "error of theta" in dataclasses.replace(end, remaining=end.remaining | unknown).criterion
+    assert "theta 1.50" in dataclasses.replace(end, remaining=end.remaining | unknown).criterion
     assert [percent_explained(share) for share in (99.99, 99.0, 0.0)] == ["99.99 %", "99.0 %", "0 %"]
     # If the baseline has no error, the explained share is undefined.
     assert np.isnan(assess({"theta": 0.0}, {"theta": 1.0}, {"theta": 1.0}, 0.0).explained["theta"])

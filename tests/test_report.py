@@ -24,12 +24,14 @@ from rotflex_jax.discover.discovery import Discovery
 from rotflex_jax.discover.explanation import Explanation, LatentTorqueComparison, remaining_failures
 from rotflex_jax.discover.learned_torque import LearnedTorqueResult
 from rotflex_jax.discover.probabilities import Probabilities, SetProbability
-from rotflex_jax.discover.result import Ranked, Round, RunErrors, Stage, Where
+from rotflex_jax.discover.result import FinalFit, Ranked, Round, RunErrors, Stage, Where
 from rotflex_jax.discover.spline_map import Formula, Term
 from rotflex_jax.discover.tables import error_lists, next_steps
 from rotflex_jax.discover.verdict import Verdict
 from rotflex_jax.effects import Coulomb, CubicSpring, LearnedTorque
 from rotflex_jax.errors import InputError
+from rotflex_jax.fit.plausibility import Remark
+from rotflex_jax.fit.result import Fit, FitOptions
 from rotflex_jax.joints import paper, single_inertia
 from rotflex_jax.latent import LatentTorque
 from rotflex_jax.models.model import Model
@@ -331,7 +333,7 @@ def test_what_a_reader_must_learn_is_there(page, discovery) -> None:
     assert "Not excited means" in text
     assert "1 of 5 candidates" in text
     assert "Most probable of the 3 sets of effects that were fitted: Coulomb friction at hub + cubic" in text
-    assert "spring at joint 72 %; then" in text and "none of these 8 %" in text
+    assert "spring at joint 72 %; " in text and "a set that was not fitted 8 %" in text
     assert "What to do next" in text
     assert "jax" in text
 
@@ -536,7 +538,7 @@ def test_tables_for_a_terminal(discovery) -> None:
     text = console.export_text()
     assert "+ cubic spring at joint" in text
     assert "theta [deg]" in text
-    assert "runs of 2 s" in text
+    assert "free runs over 2 s" in text
     assert "sensor noise" in text
     assert "hub.coulomb.level" in text
     assert "0.02980 … 0.03020" in text
@@ -701,9 +703,13 @@ def test_parameters_are_those_of_the_model_to_use(discovery, undrawn, monkeypatc
     )
     later = dataclasses.replace(discovery, rounds=(discovery.rounds[0], last))
     told = printed(later, monkeypatch, capsys)
-    assert "level = 0.03120 N m   95 %: 0.03110 .. 0.03130   (0.03000 when it was found)" in told
+    assert "level = 0.03120 N m   95 %: 0.03110 .. 0.03130   (0.03000 N m when it was added)" in told
     assert "0.02980" not in told
-    assert "0.02980 … 0.03020 · 0.03120 in the model to use" in read(render(later)).text.replace("\xa0", " ")
+    text = read(render(later)).text.replace("\xa0", " ")
+    assert (
+        "in the model to use level 0.03120 N m 95 %: 0.03110 … 0.03130 · 0.03000 N m when it was added"
+        in text
+    )
     assert "0.03110 … 0.03130" in later._repr_html_() and "0.02980" not in later._repr_html_()
     same = printed(discovery, monkeypatch, capsys)
     assert "level = 0.03000 N m   95 %: 0.02980 .. 0.03020\n" in same
@@ -718,9 +724,33 @@ def test_an_effect_that_the_model_to_use_lacks_is_said_to_be_left_out(
     )
     without = dataclasses.replace(discovery, rounds=(discovery.rounds[0], last))
     told = printed(without, monkeypatch, capsys)
-    assert "0.02980 .. 0.03020   when it was found; the model to use is without it" in told
-    assert "· not in the model to use" in read(render(without)).text
+    assert "0.02980 .. 0.03020   when it was added; the model to use is without it" in told
+    assert "· when it was added; the model to use is without it" in read(render(without)).text
     assert "hub.coulomb.level (not in the model to use)" in without._repr_html_()
+
+
+def test_a_final_fit_gives_the_descriptions_and_notes_name_the_search(
+    discovery, undrawn, monkeypatch, capsys
+) -> None:
+    """The effect in words has the values of the model to use, as the estimates below it."""
+    bound = Remark("hub.coulomb.level", "at a bound", "hub.coulomb.level = 0 N m is at its lower bound")
+    joint = paper() + Coulomb(at="hub", level=0.0377)
+    level = dataclasses.replace(discovery.final.estimates[-2], name="hub.coulomb.level", value=0.0377)
+    errors = RunErrors(discovery.final.held_out_rmse, discovery.final.held_out_rmse_windows)
+    options = FitOptions(window_seconds=2.0)
+    fit = Fit(Model(joint), 1.0, "converged", (level,), {}, np.zeros((0, 0)), (), 9, options=options)
+    last = FinalFit(fit, discovery.train, Model(joint), errors, errors)
+    found = dataclasses.replace(
+        discovery, final_fit=last, remarks=(bound,), notes=(f"{bound.sentence}.", "Another note.")
+    )
+    told, page = printed(found, monkeypatch, capsys), read(render(found)).text.replace("\xa0", " ")
+    assert "Round 1: Coulomb friction of 0.0377 N m at the hub\n" in told
+    assert "Coulomb friction of 0.0377 N m at the hub." in page
+    assert f"Round 2: {discovery.rounds[1].sentence} (values of the last round; the model to use is" in told
+    for text in (told, page):
+        assert "at its lower bound (last model of the search, before the final fit)." in text
+        assert "Another note." in text
+    assert "before the final fit" not in printed(discovery, monkeypatch, capsys)
 
 
 def test_places_name_the_recording_that_they_are_about(discovery, undrawn, monkeypatch, capsys) -> None:
@@ -753,6 +783,20 @@ def test_offsets_that_all_of_a_recording_gave_are_said_to_be(discovery) -> None:
     assert titles(2.0, (long,))[1].endswith("each recording with the offsets of its own first 2 s")
     assert titles(100.0, (long,))[1].endswith("offsets fitted to all of it, which is no longer than 100 s")
     assert titles(3.0, (long, short))[1].endswith("its own first 3 s, which is all of it in 1 of 2")
+
+
+def test_errors_of_which_most_was_used_for_the_offsets_say_so(discovery) -> None:
+    def note(seconds: float) -> str:
+        errors = RunErrors(discovery.final.held_out_rmse, discovery.final.held_out_rmse_windows)
+        first = dataclasses.replace(discovery.baseline, calibrate_seconds=seconds, calibrated=errors)
+        found = dataclasses.replace(discovery, baseline=first, rounds=(), validation=(moved(2000),))
+        return error_lists(found)[1].note
+
+    assert "used for the offsets" not in note(5.0)
+    assert note(8.0).endswith(
+        " 8.0 of 10.0 s of the validation data were used for the offsets: these errors are nearly errors of "
+        "a fit. Record more, or pass calibrate_seconds=2 (on the command line --calibrate 2)."
+    )
 
 
 def test_the_share_that_is_a_candidates_own_is_a_plain_number(discovery, undrawn) -> None:

@@ -161,10 +161,12 @@ def print_discovery(result: Any) -> None:
     Parameters are those of the model to use.
     """
     from rotflex_jax.discover.tables import (
+        description_in_use,
         error_lists,
         estimates_in_use,
         final_fit_sentence,
         has_moved,
+        notes_in_words,
         status_sentence,
         where_sentence,
     )
@@ -176,16 +178,16 @@ def print_discovery(result: Any) -> None:
     console.print(with_titles(result.sentence), markup=False)
     console.print(f"What decided: {result.assessment.criterion}.", markup=False)
     for count, added in enumerate(result.rounds, start=1):
-        console.print(f"\nRound {count}: {added.sentence}", markup=False)
+        console.print(f"\nRound {count}: {description_in_use(result, added)}", markup=False)
         if added.equation:
             console.print(f"  {added.equation}", markup=False)
         for name, used in estimates_in_use(result, added).items():
             found = added.parameters[name]
             line = estimate_line(name, used or found)
             if used is None:
-                line += "   when it was found; the model to use is without it"
+                line += "   when it was added; the model to use is without it"
             elif has_moved(found, used):
-                line += f"   ({found.texts[0]} when it was found)"
+                line += f"   ({f'{found.texts[0]} {found.unit}'.rstrip()} when it was added)"
             console.print(f"  {line}", markup=False)
         console.print(f"  {status_sentence(added)}", markup=False)
     if result.probabilities:
@@ -196,7 +198,7 @@ def print_discovery(result: Any) -> None:
         console.print(note, markup=False)
         for heading, each in (
             ("RMS error of one free run over all of it", [(name, e.whole) for name, e in errors.items()]),
-            (f"The same, restarted every {seconds} s", [(name, e.windows) for name, e in errors.items()]),
+            (f"RMS error of free runs over {seconds} s", [(name, e.windows) for name, e in errors.items()]),
         ):
             console.print(f"\n{heading}")
             console.print(error_table([*each, floor], units))
@@ -207,7 +209,7 @@ def print_discovery(result: Any) -> None:
         console.print(where_sentence(result), markup=False)
         for place in result.where:
             console.print(f"- {place.statement}", markup=False)
-    for note in result.notes:
+    for note in notes_in_words(result):
         console.print(f"Note: {note}", markup=False)
 
 

@@ -23,6 +23,8 @@ from rotflex_jax.text.numbers import percent_probable
 
 # Number of draws of the weights of half seconds, and the seed that makes them reproducible.
 DRAWS, SEED = 2000, 0
+# Effects that a search counts as calibrations of a recording.
+OFFSETS = ("voltage_offset", "sensor_bias")
 # Least probability of a set that a sentence names.
 LEAST_NAMED = 0.01
 
@@ -130,18 +132,24 @@ class Probabilities:
 
     @property
     def sentence(self) -> str:
-        """A sentence that names the most probable sets, at most three."""
+        """A sentence that names the most probable sets, at most three, and the reported one."""
         if not self.sets:
             return ""
-        named = [s for s in self.sets[:3] if s.probability >= LEAST_NAMED] or [self.sets[0]]
-        first, *others = (f"{set_label(s.effects)} {percent_probable(s.probability)}" for s in named)
-        rest = f"; then {', '.join(others)}" if others else ""
+        reported = self.evidence[0].effects if self.evidence else None
+        likeliest = [s for s in self.sets[:3] if s.probability >= LEAST_NAMED] or [self.sets[0]]
+        named = likeliest + [s for s in self.sets if s.effects == reported and s not in likeliest]
+        listed = [
+            (set_label(s.effects) + (" (the reported set)" if s.effects == reported else ""), s.probability)
+            for s in named
+        ]
+        if others := [s.probability for s in self.sets if s not in named]:
+            rest = "the other fitted set" if len(others) == 1 else "all other fitted sets together"
+            listed.append((rest, sum(others)))
+        listed.append(("a set that was not fitted", self.elsewhere))
+        each = "; ".join(f"{label} {percent_probable(p)}" for label, p in listed)
         if len(self.sets) == 1:
-            return f"One set of effects was fitted: {first}; another one {percent_probable(self.elsewhere)}."
-        return (
-            f"Most probable of the {len(self.sets)} sets of effects that were fitted: {first}{rest}; "
-            f"none of these {percent_probable(self.elsewhere)}."
-        )
+            return f"One set of effects was fitted: {each}."
+        return f"Most probable of the {len(self.sets)} sets of effects that were fitted: {each}."
 
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON types."""
@@ -176,13 +184,21 @@ def set_label(effects: frozenset[str]) -> str:
 
     >>> set_label(frozenset({"sensor_bias@alpha", "coulomb@hub"})), set_label(frozenset())
     ('Coulomb friction at hub + sensor bias of alpha', 'nothing more')
+    >>> set_label(frozenset({"voltage_offset@input"}))
+    'nothing beside voltage offset'
     """
     return " + ".join(set_labels(effects))
 
 
 def set_labels(effects: frozenset[str]) -> tuple[str, ...]:
-    """The effects of a set in words; for the user's model, one phrase that nothing was added."""
-    return tuple(effect_label(*parts(n)) for n in sorted(effects)) or ("nothing more",)
+    """The effects of a set in words; for the user's model, one phrase that nothing was added.
+
+    An offset or bias that belongs to the machine is in every set, so a set of these alone adds no effect.
+    """
+    labels = tuple(effect_label(*parts(n)) for n in sorted(effects))
+    if labels and all(parts(n)[0] in OFFSETS for n in effects):
+        return (f"nothing beside {' and '.join(labels)}",)
+    return labels or ("nothing more",)
 
 
 def set_probabilities(

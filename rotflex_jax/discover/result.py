@@ -232,7 +232,7 @@ def assess_stages(baseline: Stage, final: Stage, floor: dict[str, float]) -> Ass
         floor: Standard deviation of the sensor noise per channel.
     """
     errors = baseline.held_out_rmse_windows, final.held_out_rmse_windows
-    return assess(*errors, floor, final.process_noise_nats)
+    return assess(*errors, floor, final.process_noise_nats, final.window_seconds)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -533,7 +533,7 @@ def assign_calibrations(
     if bare is None:
         return AssignedCalibrations(validated, order, own, ())
     note = (
-        f"The training data ask for {' and '.join(map(titled, calibrations))}, but runs over "
+        f"The training data are likelier with {' and '.join(map(titled, calibrations))}, but runs over "
         "validation data are better with a model fitted without; left out."
     )
     return AssignedCalibrations(bare, [p for p in order if p in bare.hypothesis.locations], [], (note,))

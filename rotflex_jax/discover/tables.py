@@ -72,6 +72,8 @@ class ParameterRow:
     given: str = ""
 
 
+# Share of the scored data to which offsets may be fitted without a remark.
+MOST_CALIBRATED = 0.5
 FITTED_TO_ALL = "the last, fitted to all training and validation data"
 """Label of the final fit."""
 
@@ -128,6 +130,10 @@ def error_lists(discovery: SearchResult) -> list[NamedErrors]:
     if not discovery.test:
         chose += " Test recordings (test=), used for no fit and no choice, would give an unbiased error."
     tested = (last.test, last.test_calibrated) if last else (None, None)
+    short, short_tested = (
+        _mostly_calibrated(stages[0].calibrate_seconds, recordings, what)
+        for recordings, what in ((discovery.validation, "validation"), (discovery.test, "test"))
+    )
     listed = [
         (
             "Validation data",
@@ -135,9 +141,9 @@ def error_lists(discovery: SearchResult) -> list[NamedErrors]:
             [RunErrors(s.held_out_rmse, s.held_out_rmse_windows) for s in stages],
             None,
         ),
-        ("Validation data" + own, chose, [s.calibrated for s in stages], None),
+        ("Validation data" + own, chose + short, [s.calibrated for s in stages], None),
         ("Test data", not_used, [s.test for s in stages], tested[0]),
-        ("Test data" + own_tested, not_used, [s.test_calibrated for s in stages], tested[1]),
+        ("Test data" + own_tested, not_used + short_tested, [s.test_calibrated for s in stages], tested[1]),
     ]
     found = []
     for title, note, of_stages, of_fit in listed:
@@ -160,6 +166,19 @@ def _own_offsets(seconds: float, recordings: Sequence[Recording]) -> str:
         return f"offsets fitted to all of it, which is no longer than {seconds:g} s"
     ending = f", which is all of it in {short} of {count}" if short else ""
     return f"the offsets of its own first {seconds:g} s{ending}"
+
+
+def _mostly_calibrated(seconds: float, recordings: Sequence[Recording], what: str) -> str:
+    """A sentence where offsets were fitted to more than half of the data that are scored; else empty."""
+    total = sum(r.duration for r in recordings)
+    used = sum(min(r.duration, seconds) for r in recordings)
+    if used <= MOST_CALIBRATED * total:
+        return ""
+    return (
+        f" {used:.1f} of {total:.1f} s of the {what} data were used for the offsets: these errors are nearly "
+        f"errors of a fit. Record more, or pass calibrate_seconds={seconds / 4:g} (on the command line "
+        f"--calibrate {seconds / 4:g})."
+    )
 
 
 def error_tables(discovery: SearchResult) -> tuple[ErrorTable, ...]:
@@ -224,8 +243,29 @@ def final_fit_sentence(discovery: SearchResult) -> str:
     )
 
 
+def description_in_use(discovery: SearchResult, added: Round) -> str:
+    """The effect of a round in words, with its values in the model to use.
+
+    If that model lacks the effect, the values are those of the last round.
+    """
+    if discovery.final_fit is None:  # the model to use is that of the last round
+        return added.sentence
+    m = discovery.final_fit.model.mechanism
+    effect = next((e for e in m.effects if (e.name, e.at) == (added.effect, added.port)), None)
+    if effect is None:
+        return f"{added.sentence} (values of the last round; the model to use is without it)"
+    return m.sentence(effect)
+
+
+def notes_in_words(discovery: SearchResult) -> tuple[str, ...]:
+    """The notes; where there is a final fit, notes on values of the search say that they are not its own."""
+    of_search = {f"{remark.sentence}." for remark in discovery.remarks} if discovery.final_fit else set()
+    which = " (last model of the search, before the final fit)."
+    return tuple(n.removesuffix(".") + which if n in of_search else n for n in discovery.notes)
+
+
 def estimates_in_use(discovery: SearchResult, added: Round) -> dict[str, Estimate | None]:
-    """Estimates of an effect's parameters in the model to use, by short name; None where it lacks one."""
+    """Estimates of an effect's parameters in the model to use, by short name; None where it lacks it."""
     known = {e.name: e for e in discovery.estimates}
     return {name: known.get(full_name(added.port, added.effect, name)) for name in added.parameters}
 

@@ -17,7 +17,7 @@ NEAR_FLOOR = 1.5
 # An error from this multiple of the sensor noise on counts as far from the noise.
 FAR_FLOOR = 5.0
 # The model explains the recordings if process noise gains less than this per measured value of the training
-# recordings [nat], and errors of short runs over validation recordings are below `NEAR_FLOOR` times the
+# recordings [nat], and errors of short free runs over validation recordings are below `NEAR_FLOOR` times the
 # noise.
 TORQUE_NATS = 0.03
 
@@ -51,14 +51,16 @@ class Assessment:
     Attributes:
         explained: Channel -> share of the baseline's squared error that the final model explains [%]; not a
             number where runs of the baseline diverge or have no error.
-        remaining: Channel -> error of short runs that remains, in multiples of the sensor noise.
+        remaining: Channel -> error of short free runs that remains, in multiples of the sensor noise.
         torque_nats: Log-likelihood that random torques still gain per measured value of the training
             recordings [nat]; near 0 if the model is right.
+        seconds: Length of the free runs of `remaining` [s]; 0 if it is not known.
     """
 
     explained: dict[str, float]
     remaining: dict[str, float]
     torque_nats: float
+    seconds: float = 0.0
 
     @property
     def at_noise(self) -> bool:
@@ -79,8 +81,8 @@ class Assessment:
     def misfit(self) -> float:
         """How far the model is from explaining the recordings; 1 if it explains them.
 
-        It is the largest of these ratios: square of the error of short runs in a channel over its limit, and
-        gain of random torques over its limit. The limits are those of the verdict.
+        It is the largest of these ratios: square of the error of short free runs in a channel over its limit,
+        and gain of random torques over its limit. The limits are those of the verdict.
         """
         shares = [(times / NEAR_FLOOR) ** 2 for times in self.remaining.values()]
         shares.append(self.torque_nats / TORQUE_NATS)
@@ -95,23 +97,22 @@ class Assessment:
     @property
     def criterion(self) -> str:
         """The criterion that decided, as a clause."""
+        runs = f"free runs over {self.seconds:g} s" if self.seconds else "short free runs"
         unknown = [c for c, times in self.remaining.items() if math.isnan(times)]
         if not self.at_noise:
             if all(times < NEAR_FLOOR for c, times in self.remaining.items() if c not in unknown):
                 return (
                     f"the sensor noise of {' and '.join(unknown)} is not known, to compare what is left with"
                 )
-            worst = max(set(self.remaining) - set(unknown), key=lambda c: self.remaining[c])
-            return f"the error of {worst} in short runs is above {NEAR_FLOOR:g} times the sensor noise"
+            times = in_noise(self.remaining)
+            return f"errors of {runs} are {times} times the sensor noise (limit {NEAR_FLOOR:g})"
+        within = f"errors of {runs} are within {NEAR_FLOOR:g} times the sensor noise"
         if not self.torque_free:
             return (
-                f"short runs are at the noise, but predictions are likelier with a random torque "
-                f"({self.torque_nats:.2g} nat per measured value, at most {TORQUE_NATS:g})"
+                f"{within}, but predictions are likelier with a random torque ({self.torque_nats:.2g} nat "
+                f"per measured value, limit {TORQUE_NATS:g})"
             )
-        return (
-            f"short runs are within {NEAR_FLOOR:g} times the sensor noise, and predictions are hardly "
-            "likelier with a random torque"
-        )
+        return f"{within}, and predictions are hardly likelier with a random torque"
 
     @property
     def explained_text(self) -> str:
@@ -135,14 +136,16 @@ def assess(
     after: Mapping[str, float],
     floor: Mapping[str, float],
     nats: float,
+    seconds: float = 0.0,
 ) -> Assessment:
     """The assessment of a final model by its errors.
 
     Args:
-        before: Channel -> error of short runs of the baseline.
-        after: Channel -> error of short runs of the final model.
+        before: Channel -> error of short free runs of the baseline.
+        after: Channel -> error of short free runs of the final model.
         floor: Channel -> standard deviation of the sensor noise.
         nats: Log-likelihood per measured value that random torques gain over the final model [nat].
+        seconds: Length of these runs [s]; 0 if it is not known.
 
     >>> end = assess({"theta": 0.1}, {"theta": 0.002}, {"theta": 0.001}, 0.005)
     >>> round(end.explained["theta"], 2), end.remaining, end.is_explained, end.grade
@@ -151,7 +154,7 @@ def assess(
     # There is no share where runs of the baseline diverge or have no error.
     shares = {c: 100 * (1 - (after[c] / e) ** 2) if 0 < e < math.inf else math.nan for c, e in before.items()}
     remaining = {c: ratio(after[c], floor.get(c)) for c in after}
-    return Assessment(shares, remaining, nats)
+    return Assessment(shares, remaining, nats, seconds)
 
 
 def in_noise(remaining: Mapping[str, float]) -> str:
@@ -249,7 +252,7 @@ class Verdict(StrEnum):
                 "Look at the missing torque below, and at the places where the model still fails: the shape "
                 "over speed, position and voltage says what kind of effect to think of.",
                 "Check the recording (sampling, scaling, sensor range) and the constants that are "
-                "held, then try an effect of your own: one small class joins the search.",
+                "held, then try an effect of your own: the search tries a class of yours after @register.",
             ),
         ),
     )

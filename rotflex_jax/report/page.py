@@ -15,12 +15,14 @@ from rotflex_jax.discover.tables import (
     Outcome,
     channel_headings,
     channel_units,
+    description_in_use,
     error_tables,
     estimates_in_use,
     final_fit_sentence,
     has_moved,
     next_steps,
     noise_row,
+    notes_in_words,
     outcomes,
     parameter_rows,
     stage_labels,
@@ -67,7 +69,7 @@ def content(discovery: SearchResult, explanation: Explanation) -> dict[str, Any]
         "tiles": _tiles(discovery),
         "rounds": [_round(discovery, k) for k in range(len(discovery.rounds))],
         "probable": discovery.probabilities,
-        "notes": discovery.notes,
+        "notes": notes_in_words(discovery),
         "steps": next_steps(discovery),
         "stages": models,
         "final_fit": final_fit_sentence(discovery),
@@ -140,7 +142,12 @@ def tone(discovery: SearchResult) -> str:
 
 def _round(discovery: SearchResult, k: int) -> dict[str, Any]:
     added, before = discovery.rounds[k], discovery.stages[k]
-    falls, used = [], estimates_in_use(discovery, added)
+    falls, parameters = [], []
+    for name, used in estimates_in_use(discovery, added).items():
+        found = added.parameters[name]
+        e = used or found
+        shown = (name, *_shown(e), together(e.unit), _earlier(found, used))
+        parameters.append((*shown, e.note, together(e.given_words)))
     for channel, unit in channel_units(discovery).items():
         old, read = readable(before.held_out_rmse_windows[channel], unit)
         new, _ = readable(added.stage.held_out_rmse_windows[channel], unit)
@@ -148,12 +155,9 @@ def _round(discovery: SearchResult, k: int) -> dict[str, Any]:
     return {
         "title": f"{effect_title(added.effect)}, {added.port}",
         "label": f"{added.effect} at {added.port}",
-        "sentence": sentence(added.sentence),
+        "sentence": sentence(description_in_use(discovery, added)),
         "equation": equation(added.equation),
-        "parameters": [
-            (name, *_shown(e), together(e.unit), _later(e, used[name]), e.note, together(e.given_words))
-            for name, e in added.parameters.items()
-        ],
+        "parameters": parameters,
         "gain": _with_sign(added.held_out_gain_nats) if math.isfinite(added.held_out_gain_nats) else "",
         "status_sentence": status_sentence(added),
         "is_established": added.status == "established",
@@ -185,11 +189,13 @@ def _places(places: Sequence[Where]) -> list[dict[str, Any]]:
     ]
 
 
-def _later(found: Estimate, used: Estimate | None) -> str:
-    """Value of an estimate in the model to use, in words, if it differs there; empty otherwise."""
+def _earlier(found: Estimate, used: Estimate | None) -> str:
+    """Value of an estimate when its effect was added, in words, if it differs in the model to use."""
     if used is None:
-        return "not in the model to use"
-    return f"{value_and_interval(used)[0]} in the model to use" if has_moved(found, used) else ""
+        return "when it was added; the model to use is without it"
+    if not has_moved(found, used):
+        return ""
+    return f"{value_and_interval(found)[0]} {together(found.unit)}".rstrip() + " when it was added"
 
 
 def _with_sign(value: float) -> str:
@@ -242,7 +248,7 @@ def _signals(r: Recording) -> str:
 def _settings(discovery: SearchResult) -> list[tuple[str, str]]:
     seen = sorted({r.n_init for r in discovery.validation})
     rows = [
-        ("Windows of the short held-out runs", f"{discovery.baseline.window_seconds:g} s"),
+        ("Length of the short free runs", f"{discovery.baseline.window_seconds:g} s"),
         (
             "Samples at the start of each window from which the first state is estimated",
             ", ".join(map(str, seen)),

@@ -26,7 +26,7 @@ def summary_table(discovery: SearchResult) -> Table:
         header_style="bold",
     )
     table.add_column("", no_wrap=True)
-    for kind in (f"runs of {seconds}", "one long run"):
+    for kind in (f"free runs over {seconds}", "one long run"):
         for heading in channel_headings(discovery):
             table.add_column(escape(f"{heading}\n{kind}"), justify="right")
     for row in error_rows(discovery):

@@ -68,7 +68,7 @@ def probabilities(discovery: SearchResult) -> Figure | None:
 @figure(
     "ranking",
     section="ranking",
-    caption="How strongly the recordings ask for each effect before any is added. An effect low "
+    caption="How much likelier the training data are with each effect before any is added. An effect low "
     "in this list may be found in a later round, and a high one may only imitate another.",
     description="Bars of the score of each candidate effect.",
 )
@@ -210,7 +210,7 @@ def _comparable(discovery: SearchResult) -> dict[str, list[Estimate | None]]:
 @figure(
     "parameters",
     section="parameters",
-    caption="Missing physics bends the parameters that are there; they stop changing once it is added. "
+    caption="Missing physics biases the estimates of a model; they stop changing once it is added. "
     "Bars are 95 % intervals; parameters near zero are only in the table.",
     description="Parameters of each model relative to their final values, with intervals.",
 )

@@ -228,7 +228,7 @@ def _over_motion(discovery: SearchResult, explanation: Explanation) -> str:
         "The torque that would have to be added at each port for the model to follow what was "
         "measured (Kalman smoother). Shaded: 95 % band of the mean; grey: spread of single samples. "
         "Damper and spring of a fitted model take over the slope of what is missing; the panels "
-        "marked + give back "
+        "marked + add this part again: "
         + (
             "what they have more than in the final model, whose own torque (dashed) should be flat."
             if better
@@ -252,7 +252,7 @@ def latent_over_motion(discovery: SearchResult, explanation: Explanation) -> Fig
 @figure(
     "latent_time",
     section="torque",
-    caption="The same torques in time, on held-out data, and by frequency. Fast changes drown in the "
+    caption="The same torques in time, on held-out data, and by frequency. Fast changes are below the "
     "noise of the sensor, so a jump looks rounded.",
     description="The unknown torque at each port over time with its band, and its spectrum.",
 )
