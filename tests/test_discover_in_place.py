@@ -77,7 +77,7 @@ def test_all_laws_and_rivals_take_the_place_once(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(in_place, "without", less)
     monkeypatch.setattr(in_place, "parameter_count", lambda s, h, p: 3)
     monkeypatch.setattr(in_place, "nats_left", lambda at, found: 70.0 if at == "predictions" else 0.0)
-    monkeypatch.setattr(in_place, "describe", lambda rival, found: str(rival.location))
+    monkeypatch.setattr(in_place, "gains_in_words", lambda rival, found: "gains")
     lines: list[str] = []
     state: Any = SimpleNamespace(
         problem=SimpleNamespace(supermodel=supermodel(), measured_values=100.0),
@@ -109,8 +109,9 @@ def test_a_law_that_data_prefer_takes_the_place(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(in_place, "_shape_at_bound", lambda s, v, known: v.location == COULOMB)
     monkeypatch.setattr(in_place, "shares_of_gain", lambda rivals, found: np.array([1.0, 1.5]))
     monkeypatch.setattr(in_place, "parameter_count", lambda s, h, p: 3)
-    monkeypatch.setattr(in_place, "describe", lambda rival, found: str(rival.location))
-    state = SearchState(Any, Any, lambda line: None, final)
+    monkeypatch.setattr(in_place, "gains_in_words", lambda rival, found: "gains")
+    lines: list[str] = []
+    state = SearchState(Any, Any, lines.append, final)
     state.scores, state.gains = {DELAY: 2.0, STRIBECK: 1.0}, {DELAY: "a", STRIBECK: "b"}
     state.rivals = {DELAY: [LAG], STRIBECK: [LUGRE, COULOMB]}
     monkeypatch.setattr(
@@ -118,6 +119,7 @@ def test_a_law_that_data_prefer_takes_the_place(monkeypatch: pytest.MonkeyPatch)
     )
     monkeypatch.setattr(in_place, "predictions_apart", lambda rival, found: True)
     (note,) = in_place.take_better_laws(state)
+    assert lines == ["  lugre at hub instead of stribeck at hub: gains"]
     assert note.startswith("LuGre friction at hub has taken the place of Stribeck friction at hub, which its")
     assert state.current.hypothesis is best.hypothesis and state.current.location is None
     assert list(state.scores.items()) == [(DELAY, 2.0), (LUGRE, 1.0)]

@@ -230,6 +230,7 @@ def test_a_cogging_that_repeats_less_than_half_a_time_is_beyond_the_recordings()
         assert not beyond_recordings(m.trust(name), reach)
         assert not beyond_recordings(m, reach._replace(position={}))
     close = beyond_recordings(m, reach._replace(position={"hub": np.radians(10.0)}))
+    assert close[0].sentence.startswith("hub.cogging.periods = 4 per turn is less than half a period")
     assert "(20 degrees)" in close[0].sentence and "spring or a constant torque" in close[0].sentence
 
 

@@ -1,6 +1,7 @@
 """The latent torque against a textbook smoother in numpy, SciPy's optimum, and torques that are known."""
 
 import dataclasses
+import re
 
 import jax
 import jax.numpy as jnp
@@ -204,7 +205,10 @@ def test_the_intensity_is_that_of_scipy():
 
 def test_friction_is_seen_within_its_band():
     r, made = recorded({("coulomb", "hub"): {"level": 0.03}})
-    found = latent_torque(paper(**TRUE), r)
+    lines: list[str] = []
+    found = latent_torque(paper(**TRUE), r, progress=lines.append)
+    said = r"latent torque: intensity of its random walk hub \S+ \(N m\)\^2/s, joint \S+ \(N m\)\^2/s"
+    assert re.fullmatch(said, lines[-1])
     speed = made["state"][:, 2]
     truth, sliding = -0.03 * np.sign(speed), np.abs(speed) > 0.6
     off = found.torque[:, 0] - truth
