@@ -98,9 +98,14 @@ CONTENT: dict[str, tuple[bytes, dict[str, Any], str]] = {
     "time stands": (text(t=late(50, -0.002)), {}, "duplicate time stamp between lines 51 and 52"),
     "jitter": (text(t=late(50, 1e-4)), {}, r"jittery: .* lines 5[12] and 5[23] .*off by 5 %"),
     "milliseconds": (text(t=2.0 * np.arange(N)), {}, "advances by 2 .*looks like milliseconds"),
-    "named ms": (
+    "seconds of ms": (
         text(edited(0, "t_ms,voltage,theta,alpha")),
-        {"time": "t_ms"},
+        {"time": "t_ms", "time_unit": "s"},
+        "'t_ms' is in ms by its name, but time_unit='s' was given; pass time_unit='ms'",
+    ),
+    "ms in front": (
+        text(edited(0, "ms_since_start,voltage,theta,alpha")),
+        {"time": "ms_since_start"},
         "in ms by its name, but seconds are needed",
     ),
     "named mV": (
@@ -124,26 +129,38 @@ CONTENT: dict[str, tuple[bytes, dict[str, Any], str]] = {
         {"outputs": "theta"},
         "'theta' turns at up to .* looks like degrees; pass degrees=True",
     ),
-    "named deg": (
-        text(edited(0, NAMED_IN_DEGREES)),
-        OWN_NAMES,
-        "'theta_deg' is in deg by its name, but degrees=False was given; pass degrees=True",
-    ),
     "degrees of radians": (
         text(edited(0, "t,voltage,theta (rad),alpha (rad)")),
         {"outputs": ("theta (rad)", "alpha (rad)"), "degrees": True},
-        "in rad by its name, but degrees=True was given",
+        "in rad by its name, but degrees=True was given, which is for all .* units={'theta': 'deg'}",
     ),
-    "unit ms": (
-        text(edited(0, "t,voltage,theta,alpha\nms,V,rad,rad")),
-        {},
-        "'t' is in ms by its line of units, but seconds are needed",
+    "degrees of a unit rad": (
+        text(),
+        {"degrees": True, "units": {"theta": "deg", "alpha": "rad"}},
+        "'alpha' was given in rad, but degrees=True was given too",
     ),
-    "unit deg": (
-        text(edited(0, "t,voltage,theta,alpha\ns,V,deg,deg")),
-        {},
-        "'theta' is in deg by its line of units, but degrees=False was given; pass degrees=True",
+    "rad of the name deg": (
+        text(edited(0, NAMED_IN_DEGREES)),
+        {**OWN_NAMES, "units": {"theta": "rad"}},
+        "'theta_deg' is in deg by its name, but was given in rad",
     ),
+    "deg of the unit rad": (
+        text(edited(0, "t,voltage,theta,alpha\ns,V,rad,rad")),
+        {"units": {"theta": "deg"}},
+        "'theta' is in rad by its line of units, but was given in deg",
+    ),
+    "counts in degrees": (text(), {"counts": 4096, "units": {"theta": "deg"}}, "in deg and as counts=4096"),
+    "us below a name with ms": (
+        text(edited(0, "t,voltage,theta,alpha\nus,V,rad,rad")),
+        {"time_unit": "ms"},
+        "'t' is in us by its line of units, but time_unit='ms' was given",
+    ),
+    "goal in volts": (
+        text(edited(0, "t,Voltage [V],theta,alpha")),
+        {"input": "Voltage [V]", "units": {"Voltage [V]": "rad"}},
+        "'Voltage .V.' is in V by its name, but an input in rad is needed",
+    ),
+    "goal named voltage": (text(), {"units": {"voltage": "rad"}}, "'voltage' is in V by its name"),
     "text below the units": (
         text(edited(0, "t,voltage,theta,alpha\ns,V,rad,rad\nx,0,0,0")),
         {},
@@ -157,7 +174,7 @@ CONTENT: dict[str, tuple[bytes, dict[str, Any], str]] = {
     "contradicting Ts": (text(), {"Ts": 0.001}, "advances by 0.002 s, but Ts=0.001 was given"),
     "no Ts": (text(t=None), {"Ts": 0.0}, "`Ts` must be a positive number of seconds, but is 0"),
     "input as output": (text(), {"input": "theta"}, "'theta' was given as input and as output"),
-    "outputs twice": (text(), {"outputs": ("theta", "theta")}, "column of theta, then"),
+    "outputs twice": (text(), {"outputs": ("theta", "theta")}, "has one column, 'theta', for two channels"),
     "three outputs": (text(), {"outputs": ("t", "theta", "alpha")}, "give a mapping such as"),
     "no outputs": (text(), {"outputs": ()}, "`outputs` must name the column of theta"),
     "constant input": (text(voltage=np.full(N, 0.5)), {}, "'voltage' is 0.5 V throughout"),
@@ -201,7 +218,8 @@ def test_the_good_run_of_this_file_is_accepted(tmp_path: Path) -> None:
     (tmp_path / "run.csv").write_bytes(text())
     assert load(tmp_path / "run.csv").N == N
     (tmp_path / "run.csv").write_bytes(text(edited(0, NAMED_IN_DEGREES)))
-    assert load(tmp_path / "run.csv", degrees=True, **OWN_NAMES).N == N
+    named = load(tmp_path / "run.csv", **OWN_NAMES)
+    assert np.array_equal(named.y, load(tmp_path / "run.csv", degrees=True, **OWN_NAMES).y)
 
 
 def pickled(path: Path) -> None:

@@ -124,7 +124,7 @@ def test_what_cannot_be_exported_is_said_in_one_sentence(run, saved, tmp_path):
         ((saved, "--to", "fmu"), ("archive", "--out")),
         (("paper", "--to", "bam"), ("one servo", "xl330_pendulum")),
         ((tmp_path / "no.xml", "--to", "text"), ("cannot be read",)),
-        ((saved, "--to", "c", "--Ts", "-1"), ("`Ts` must be a finite number above 0", "-1")),
+        ((saved, "--to", "c", "--Ts", "-1"), ("--Ts must be a finite number above 0", "-1")),
         ((tmp_path / "no.json", "--to", "text"), ("does not exist",)),
         ((saved, "--to", "text", "--out", tmp_path / "no" / "where.txt"), ("does not", "exist")),
     ):

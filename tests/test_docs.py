@@ -137,16 +137,21 @@ RAISED: dict[str, Callable[[], object]] = {
         file(t=None, clock=GOOD["t"], voltage=None, u=GOOD["voltage"], theta=None, hub=GOOD["theta"])
     ),
     "line of remarks": lambda: rf.load(lines(lambda rows: [rows[0], "s,V,rad,rad", "run 3,,,", *rows[1:]])),
-    "degrees by unit": lambda: rf.load(lines(lambda rows: [rows[0], "s,V,deg,deg", *rows[1:]])),
+    "degrees by unit": lambda: rf.load(
+        lines(lambda rows: [rows[0], "s,V,rad,rad", *rows[1:]]), units={"theta": "deg"}
+    ),
+    "degrees in the recording": lambda: rf.Model(rf.joints.paper(sensors="theta")).simulate(
+        rf.Recording(GOOD["voltage"], GOOD["theta"], 0.002, "theta", "deg")
+    ),
     "two names in one": lambda: rf.load(file(), outputs="theta,alpha"),
     "in the room": lambda: doubted(in_the_room()),
     "counts": lambda: rf.load(file(theta=np.round(4096 / 6.28 * GOOD["theta"]))),
     "swapped": swapped,
-    "milliseconds by name": lambda: rf.load(file(t=None, t_ms=1000 * GOOD["t"]), time="t_ms"),
+    "milliseconds by name": lambda: rf.load(file(t=None, t_ms=1000 * GOOD["t"]), time="t_ms", time_unit="s"),
     "no time": lambda: rf.load(file(t=None)),
     "no header": lambda: rf.load(lines(lambda rows: rows[1:])),
     "degrees by name": lambda: rf.load(
-        file(theta=None, theta_deg=GOOD["theta"]), outputs=("theta_deg", "alpha")
+        file(theta=None, theta_rad=GOOD["theta"]), outputs=("theta_rad", "alpha"), degrees=True
     ),
     "degrees by size": lambda: recording(alpha=np.rad2deg(2 * GOOD["alpha"])),
     "millivolts": lambda: recording(voltage=1000 * GOOD["voltage"]),

@@ -468,10 +468,12 @@ def test_a_sensor_that_is_not_read_is_said_and_the_cure_works(run, tmp_path, mon
 
     monkeypatch.setattr(rf, "discover", kept)
     _, _, err = run("discover", file)
-    assert "theta alone is read, though the file has 'speed' too" in err
+    assert err.startswith("Look at run.csv: The file has 'speed' too, but theta is the only output") and (
+        err.count("run.csv") == 1
+    )
     assert "--joint paper:sensors=theta+speed" in err and searched[0][0].channels == ("theta",)
     _, _, err = run("discover", file, "--joint", "paper:sensors=theta+speed")
-    assert "alone" not in err and searched[1][0].channels == ("theta", "speed")
+    assert "only output" not in err and searched[1][0].channels == ("theta", "speed")
     assert searched[1][1].units == ("rad", "rad/s") and np.allclose(searched[1][1].y[:, 1], speed[:2100])
     # Nothing is left out where both angles are read, or where the file has no other sensor.
     for table in (frame(speed=speed), frame(alpha=None)):
@@ -508,7 +510,7 @@ def test_objects_that_only_matlab_reads_are_named(measured) -> None:
     from rotflex_jax.data.datasets import fetch
 
     measured("rotflex")
-    with pytest.raises(InputError, match=r"objects that only MATLAB reads .*\(string\): save a timetable"):
+    with pytest.raises(InputError, match=r"it has .*data_vm\[1\], .*; control_mode \(MATLAB strings"):
         rf.load(fetch("rotflex")[0])
 
 
@@ -543,12 +545,91 @@ def test_a_spreadsheet_without_its_package_says_which(tmp_path, monkeypatch) -> 
         rf.load(tmp_path / "run.xlsx")
 
 
-def test_a_channel_that_keeps_its_own_unit_is_not_converted(tmp_path) -> None:
+def test_degrees_are_converted_and_other_units_are_kept(tmp_path) -> None:
     rows = np.column_stack([np.arange(60) * 0.01, np.sin(np.arange(60)), 100 * np.cos(np.arange(60))])
-    np.savetxt(tmp_path / "a.csv", rows, delimiter=",", header="t [s],u [V],w [deg/s]", comments="")
+    np.savetxt(tmp_path / "a.csv", rows, delimiter=",", header="t [s],u [V],w", comments="")
     told = {"time": "t", "input": "u", "outputs": {"w": "w"}}
-    kept = rf.load(tmp_path / "a.csv", **told, units={"w": "deg/s"})
-    np.testing.assert_allclose(kept.y[:, 0], rows[:, 2])
-    assert kept.units == ("deg/s",)
+    for unit, kept, factor in (("deg/s", "rad/s", np.pi / 180), ("rad/s", "rad/s", 1.0), ("mm", "mm", 1.0)):
+        found = rf.load(tmp_path / "a.csv", **told, units={"w": unit})
+        np.testing.assert_allclose(found.y[:, 0], factor * rows[:, 2])
+        assert found.units == (kept,)
     with pytest.raises(InputError, match="was to be converted to rad"):
-        rf.load(tmp_path / "a.csv", **told, units={"w": "deg/s"}, degrees=True)
+        rf.load(tmp_path / "a.csv", **told, units={"w": "mm"}, degrees=True)
+
+
+def test_one_angle_in_degrees_and_one_in_radians(run, tmp_path) -> None:  # noqa: F811
+    mixed = frame(theta=None, alpha=None, servo_deg=np.rad2deg(THETA), arm_rad=ALPHA)
+    names = ("servo_deg", "arm_rad")
+    assert np.allclose(rf.load(mixed, outputs=names).y, RECORDING.y)
+    plain = mixed.rename(columns={"servo_deg": "servo", "arm_rad": "arm"})
+    assert np.allclose(rf.load(plain, outputs=("servo", "arm"), units={"theta": "deg"}).y, RECORDING.y)
+    below = frame(theta=np.rad2deg(THETA)).astype(object)
+    below.loc[-1] = ["ms", "V", "deg", "rad"]
+    below = below.sort_index()
+    below.loc[0:, "t"] = 1e3 * T
+    below.to_csv(tmp_path / "units.csv", index=False)
+    found = rf.load(tmp_path / "units.csv")
+    assert np.allclose(found.y, RECORDING.y) and found.Ts == pytest.approx(RECORDING.Ts)
+    mixed.to_csv(tmp_path / "mixed.csv", index=False)
+    plain.to_csv(tmp_path / "plain.csv", index=False)
+    both = ("--output", "servo_deg", "--output", "arm_rad")
+    assert run("check", tmp_path / "mixed.csv", *both)[0] == 0
+    status, _, err = run("check", tmp_path / "mixed.csv", *both, "--degrees")
+    assert status == 2
+    assert_one_sentence(err, "'arm_rad' is in rad by its name", "leave --degrees out", "theta [deg]=COLUMN")
+    told = ("--output", "theta [deg]=servo", "--output", "alpha=arm")
+    status, out, err = run("check", tmp_path / "plain.csv", *told)
+    assert status == 0, err
+    assert out == run("check", tmp_path / "mixed.csv", *both)[1].replace("mixed.csv", "plain.csv")
+    milli = ("--output", "theta [mrad]=servo", "--output", "alpha=arm")
+    status, _, err = run("check", tmp_path / "plain.csv", *milli)
+    assert status == 2
+    assert_one_sentence(err, "'theta' is in mrad, but that of the model is in rad")
+    twice = ("--output", "theta=servo", "--output", "theta=arm")
+    status, _, err = run("check", tmp_path / "plain.csv", *twice)
+    assert status == 2
+    assert_one_sentence(err, "the channel 'theta' for 'servo' and for 'arm'")
+
+
+def test_a_model_in_radians_takes_no_recording_in_degrees() -> None:
+    recording = rf.Recording(
+        RECORDING.u, RECORDING.y, RECORDING.Ts, channels=RECORDING.channels, units=("deg", "rad")
+    )
+    with pytest.raises(InputError, match=r"'theta' .* in deg, but the output theta of the model is in rad"):
+        rf.Model(rf.joints.paper()).simulate(recording)
+
+
+def test_the_voltage_is_not_read_as_the_goal_of_a_servo(run, tmp_path) -> None:  # noqa: F811
+    servo = ("--joint", "position_servo", "--output", "theta")
+    for header, given in (("voltage", ()), ("Voltage [V]", ("--input", "Voltage [V]"))):
+        frame().rename(columns={"voltage": header}).to_csv(tmp_path / "run.csv", index=False)
+        status, _, err = run("check", tmp_path / "run.csv", *servo, *given)
+        assert status == 2
+        assert_one_sentence(err, "in V", "in rad", "--input")
+
+
+def test_a_deflection_is_not_made_relative_twice(run, tmp_path) -> None:  # noqa: F811
+    frame().to_csv(tmp_path / "run.csv", index=False)
+    with pytest.raises(InputError, match="leave arm_absolute=True out"):
+        rf.load(tmp_path / "run.csv", arm_absolute=True)
+    status, _, err = run("check", tmp_path / "run.csv", "--arm-absolute")
+    assert status == 2
+    assert_one_sentence(err, "held the deflection already", "leave --arm-absolute out")
+    assert rf.load(tmp_path / "run.csv", arm_absolute=True, accept="absolute").N == RECORDING.N
+
+
+def test_one_model_is_given_once(run, tmp_path) -> None:  # noqa: F811
+    frame().to_csv(tmp_path / "run.csv", index=False)
+    saved = rf.Model(rf.joints.paper()).save(tmp_path / "A_model.json")
+    for command in ("check", "simulate", "discover", "compare"):
+        status, _, err = run(command, tmp_path / "run.csv", "--model", saved, "--joint", "paper")
+        assert status == 2
+        assert_one_sentence(err, "A_model.json and paper were given")
+    assert run("check", tmp_path / "run.csv", "--joint", "paper", "--model", "paper")[0] == 0
+
+
+def test_findings_name_options_of_the_command_line(run, tmp_path) -> None:  # noqa: F811
+    frame(t=None).to_csv(tmp_path / "run.csv", index=False)
+    status, out, err = run("check", tmp_path / "run.csv", "--Ts", 4, "--accept", "slow", "--accept", "units")
+    assert status == 0, err
+    assert "warning: The sampling period is 4 s" in out and "pass --Ts 0.004, or --accept slow" in out

@@ -142,9 +142,9 @@ def test_a_long_sampling_period_is_refused_as_an_option_as_in_a_column() -> None
     frame = table().drop(columns="t")
     assert "advances by 2.5 per sample, too slow" in refused(table(t=1000 * T))
     said = refused(frame, Ts=2.5)
-    assert "given as 2.5 s, too slow for a joint" in said and "pass Ts=0.0025, or accept=('slow',)" in said
+    assert "period is 2.5 s, too slow for a joint" in said and "pass Ts=0.0025, or accept=('slow',)" in said
     y = np.column_stack([THETA, ALPHA])
-    with pytest.raises(InputError, match=r"given as 2\.5 s, too slow"):
+    with pytest.raises(InputError, match=r"period is 2\.5 s, too slow"):
         rf.Recording(u=U, y=y, Ts=2.5)
     for options in ({"Ts": 2.5, "accept": "slow"}, {"Ts": 2.5, "time_unit": "s"}, {"Ts": 0.499}):
         assert rf.load(frame, **options).Ts == options["Ts"]

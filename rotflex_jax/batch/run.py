@@ -20,7 +20,7 @@ from rotflex_jax.discover import discover
 from rotflex_jax.errors import InputError
 from rotflex_jax.joints.by_name import choose
 from rotflex_jax.mechanism import Mechanism
-from rotflex_jax.mechanism.linear import output_units
+from rotflex_jax.mechanism.linear import output_units, units_to_read
 from rotflex_jax.models.model import Model
 from rotflex_jax.recording import Recording
 
@@ -86,7 +86,7 @@ def fleet(
         choose(name, inspect.signature(load).parameters, "argument of load")
     places = places_of(model, search, far=scheduler is not None)
     units = output_units(model.mechanism)
-    reading = {"outputs": {c: c for c in units}, "units": units, **reading}
+    reading = {"outputs": {c: c for c in units}, "units": units_to_read(model.mechanism), **reading}
     task = SearchTask(Path(), reading, split, _pickled(model, search), places, pages)
     common = storage.digest_of_search(model, search, split, reading, places)
     batch = BatchProgress(sources, task, common, storage.created(folder, pages), progress)

@@ -49,10 +49,10 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
             standalone_mode=False,
         )
     except InputError as error:
-        _refuse(str(error))
+        _refuse(given.as_options(str(error)))
     except _UsageError as error:
         context = getattr(error, "ctx", None)
-        command = context.command_path if context else "rotflex"
+        command = context.command_path if context else f"rotflex{_named_command(arguments)}"
         fault = error.format_message().rstrip(".")
         _refuse(f"{fault}; {command} --help lists what can be given.")
     except OSError as error:
@@ -62,6 +62,12 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     if status == STOPPED:  # typer returns it after Ctrl-C, if the process belongs to another program
         print("rotflex: stopped", file=sys.stderr)
     sys.exit(status if isinstance(status, int) else 0)
+
+
+def _named_command(arguments: Sequence[str] | None) -> str:
+    """The command that the arguments begin with, after a space; empty if they begin with none."""
+    first = next(iter(sys.argv[1:] if arguments is None else arguments), "")
+    return f" {first}" if first in {c.__name__ for c in _COMMANDS} else ""
 
 
 def _refuse(sentence: str) -> NoReturn:
@@ -95,7 +101,7 @@ def demo(report: given.ReportFolder = Path("rotflex-demo"), json_file: given.Jso
 @reads_files
 def discover(
     files: given.Files,
-    joint: given.JointName = "paper",
+    joints: given.JointNames = None,
     held_out: given.HeldOut = None,
     test: given.Test = None,
     split: given.Share = None,
@@ -120,7 +126,7 @@ def discover(
     given.check_distinct(files, [*(held_out or []), *(test or [])])
     given.check_writable(json_file=json_file, folder=report)
     given.check_writable(json_file=save_model)
-    model, columns = columns.of(by_name.model(joint_for(files, joint, columns)))
+    model, columns = columns.of(by_name.model(joint_for(files, given.one_model(joints), columns)))
     if each:
         search_each(model, files, columns, share, report, json_file, scheduler, workers, calibrate)
         return
@@ -137,7 +143,7 @@ def compare(
     files: given.Files,
     methods: given.Methods = None,
     quick: given.Quick = False,
-    joint: given.JointName = "paper",
+    joints: given.JointNames = None,
     held_out: given.HeldOut = None,
     split: given.Share = None,
     report: given.ReportFolder = None,
@@ -153,7 +159,7 @@ def compare(
         raise InputError(
             "Options --quick and --methods were both given, but each says which methods to run; give one."
         )
-    model, columns = columns.of(by_name.model(joint_for(files, joint, columns)))
+    model, columns = columns.of(by_name.model(joint_for(files, given.one_model(joints), columns)))
     names = methods if methods is None else methods.split(",")
     from rotflex_jax.compare import QUICK
     from rotflex_jax.compare.method import selected_methods
@@ -271,6 +277,7 @@ def _report(result: Any, folder: Path | None, json_file: Path | None) -> None:
 
 
 # In the order in which a newcomer needs them.
-for _command in (demo, check, discover, compare, simulate, experiment, export, effects, reproduce, arena):
+_COMMANDS = (demo, check, discover, compare, simulate, experiment, export, effects, reproduce, arena)
+for _command in _COMMANDS:
     app.command()(_command)
 app.add_typer(data_app, name="data")

@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import re
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -25,14 +26,14 @@ Files = Annotated[
         "a file for each channel; or rotflex, the public data set.",
     ),
 ]
-JointName = Annotated[
-    str,
+JointNames = Annotated[
+    list[str] | None,
     typer.Option(
         "--joint",
         "--model",
         metavar="NAME",
-        help=f"Model to start from: {', '.join(JOINTS)}, parameters as paper:stiffness=1.2; your own as "
-        "FILE.py:NAME; or a saved MODEL.json.",
+        help=f"Model to start from: {', '.join(JOINTS)} (paper unless given), parameters as "
+        "paper:stiffness=1.2; your own as FILE.py:NAME; or a saved MODEL.json.",
     ),
 ]
 InputColumn = Annotated[
@@ -46,7 +47,7 @@ OutputColumns = Annotated[
     typer.Option(
         "--output",
         metavar="COLUMN",
-        help="Column of theta, and once more for that of alpha; or CHANNEL=COLUMN.",
+        help="Column of theta, and once more for that of alpha; or CHANNEL=COLUMN, CHANNEL [deg]=COLUMN.",
     ),
 ]
 Signals = Annotated[
@@ -58,7 +59,12 @@ Signals = Annotated[
         "base; or NAME [UNIT]=COLUMN; may be repeated.",
     ),
 ]
-Degrees = Annotated[bool, typer.Option("--degrees", help="Angles in the files are in degrees.")]
+Degrees = Annotated[
+    bool,
+    typer.Option(
+        "--degrees", help='All angles are in degrees; for one of two, --output "theta [deg]=COLUMN".'
+    ),
+]
 SamplingPeriod = Annotated[
     float | None,
     typer.Option("--Ts", metavar="SECONDS", help="Sampling period, where no column has the time."),
@@ -337,6 +343,46 @@ def was_given(context: typer.Context, name: str) -> bool:
     """Whether an option was written on the command line, and not left at its default."""
     source = context.get_parameter_source(name)
     return source is not None and source.name != "DEFAULT"
+
+
+def one_model(given: Sequence[str] | None) -> str:
+    """The model that --joint and --model, two names of one option, give.
+
+    Raises:
+        InputError: They give several.
+    """
+    if not given:
+        return "paper"
+    if len(set(given)) > 1:
+        raise InputError(
+            f"{' and '.join(dict.fromkeys(given))} were given with --joint or --model, two names of one "
+            "option, but there is one model; give one of them."
+        )
+    return given[0]
+
+
+def as_options(sentence: str) -> str:
+    """A sentence about arguments in Python, in terms of the options of the command line."""
+    sentence = re.sub(r"accept=\('(\w+)',\)", r"--accept \1", sentence)
+    sentence = sentence.replace("degrees=True", "--degrees")
+    sentence = re.sub(r"\bunits=\{'(\w+)': '([^']+)'\}", r'--output "\1 [\2]=COLUMN"', sentence)
+    sentence = sentence.replace("arm_absolute=True", "--arm-absolute")
+    sentence = re.sub(r"\btime_unit='(\w+)'", r"--time-unit \1", sentence)
+    sentence = re.sub(r"\btime_unit=(?!')", "--time-unit", sentence)
+    sentence = re.sub(r"\bresample='?(\w+)'?", r"--resample \1", sentence)
+    sentence = re.sub(r"\bcounts=\{'(\w+)': (\d+)\}", r"--counts \1=\2", sentence)
+    sentence = re.sub(r"\b(input|time|Ts|counts)=(?=\d)", r"--\1 ", sentence)
+    sentence = sentence.replace("leave Ts out", "leave --Ts out")
+    sentence = re.sub(r"\boutputs=\{'(\w+)': 'COLUMN'\}", r"--output \1=COLUMN", sentence)
+    sentence = sentence.replace(
+        "the model starting values nearer to the machine",
+        "starting values nearer to the machine, such as --joint paper:stiffness=1.2",
+    )
+    sentence = re.sub(r"\b(input|time|Ts)=", r"--\1", sentence)
+    sentence = re.sub(r"\boutputs=|Argument `outputs`", "--output", sentence)
+    sentence = re.sub(r"\bsignals=|Argument `signals`", "--signal", sentence)
+    sentence = re.sub(r"a mapping such as \{'([^']+)': '(\w+)'\}", r'for instance "\1=\2"', sentence)
+    return re.sub(r"Argument `(\w+)`", lambda m: "--" + m[1].replace("_", "-"), sentence)
 
 
 def check_distinct(files: Sequence[Path], held_out: Sequence[Path]) -> None:

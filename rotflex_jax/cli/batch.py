@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from rotflex_jax.cli import arguments as given, terminal
-from rotflex_jax.cli.recordings import Columns, as_options
+from rotflex_jax.cli.recordings import Columns
 from rotflex_jax.errors import InputError
 from rotflex_jax.text.files import write_file
 
@@ -63,20 +63,20 @@ def search_each(
             workers=workers,
             split=share,
             pages=True,
-            progress=lambda line: step(as_options(line)),
+            progress=lambda line: step(given.as_options(line)),
             **options,
             **columns.reading(),
         )
     if len(result.failed) == len(files):
         raise InputError(
             f"No search of {len(files)} gave an answer; the first, {result.rows[0].name}: "
-            f"{as_options(result.rows[0].reason)}"
+            f"{given.as_options(result.rows[0].reason)}"
         )
     text = json.dumps(result.to_dict(), indent=2)
     if json_file == given.STDOUT:
         print(text)
     else:
-        terminal.print_fleet(result, as_options)
+        terminal.print_fleet(result)
         if json_file is not None:
             write_file(json_file, text + "\n")
     terminal.message(f"Summary: {result.page}", error=json_file == given.STDOUT)

@@ -57,9 +57,8 @@ def data_fetch(
 
 @reads_files
 def check(
-    context: typer.Context,
     files: given.Files,
-    joint: given.JointName = "paper",
+    joints: given.JointNames = None,
     *,
     columns: Columns,
 ) -> None:
@@ -67,9 +66,9 @@ def check(
 
     With --joint also which parameters of that model the recording can determine.
     """
-    named = given.was_given(context, "joint")
+    named = bool(joints)
     given.check_distinct(files, [])
-    joint = joint_for(files, joint, columns)
+    joint = joint_for(files, given.one_model(joints), columns)
     model = by_name.model(joint)
     model, columns = columns.of(model)
     from rotflex_jax.fit.plausibility import check_signs

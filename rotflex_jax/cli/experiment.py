@@ -45,7 +45,7 @@ def experiment(
     deflection: given.Deflection = math.inf,
     seconds: given.Length = 20.0,
     rank_only: given.RankOnly = False,
-    joint: given.JointName = "paper",
+    joints: given.JointNames = None,
     add: given.FoundBefore = None,
     save: given.InputFile = None,
     plot: given.PlotFile = None,
@@ -105,7 +105,7 @@ def experiment(
         )
     if given.STDOUT in (save, plot, state):
         raise InputError("A file was given as -, but only --json goes to stdout; name the file.")
-    model = by_name.model(joint, add or ())
+    model = by_name.model(given.one_model(joints), add or ())
     model, columns = columns.of(model)
     first, second, *others = (by_name.effect(text) for text in (*between, *(further or ())))
     if (first.name, first.at) == (second.name, second.at):

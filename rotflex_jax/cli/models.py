@@ -13,7 +13,7 @@ from rotflex_jax.text.files import write_file
 @reads_files
 def simulate(
     file: given.OneFile,
-    joint: given.JointName = "paper",
+    joints: given.JointNames = None,
     add: given.AddedEffects = None,
     fit: given.FittedBefore = None,
     save: given.SimulationFile = None,
@@ -27,7 +27,7 @@ def simulate(
     for target in (save, save_model):
         given.check_writable(json_file=target)
     given.check_writable(folder=report)
-    model = by_name.model(joint, add or ())
+    model = by_name.model(given.one_model(joints), add or ())
     model, columns = columns.of(model)
     recording = columns.load(file)
     train = [columns.load(other) for other in fit or []]

@@ -3,7 +3,6 @@
 import dataclasses
 import functools
 import inspect
-import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -104,11 +103,9 @@ class Columns:
         if not file.exists():
             raise InputError(f"{file} does not exist; give the path of a recording.")
         from rotflex_jax.data import load
+        from rotflex_jax.mechanism.linear import output_units
 
-        try:
-            recording = load(file, **self.reading())
-        except InputError as error:
-            raise InputError(as_options(str(error))) from None
+        recording = load(file, **self.reading())
         driven = "" if self.mechanism is None else self.mechanism.units.input
         if driven and recording.input_unit != driven and "units" not in recording.accept:
             raise InputError(
@@ -117,6 +114,13 @@ class Columns:
                 "such an input (--model FILE.py:NAME, for a current one with CurrentDrive), or "
                 "--accept units."
             )
+        for channel, unit in ({} if self.mechanism is None else output_units(self.mechanism)).items():
+            given = recording.unit(channel) if channel in recording.channels else unit
+            if given != unit and "units" not in recording.accept:
+                raise InputError(
+                    f"{recording.source}: the output {channel!r} is in {given}, but that of the model is in "
+                    f"{unit}; convert the column, or --accept units."
+                )
         driving = () if self.mechanism is None else self.mechanism.signals
         lacking = next((name for name in driving if name not in recording.signals), None)
         if lacking is not None:
@@ -129,12 +133,14 @@ class Columns:
 
     def reading(self) -> dict[str, Any]:
         """The options as arguments of `rotflex_jax.load`."""
-        from rotflex_jax.mechanism.linear import output_units
+        from rotflex_jax.mechanism.linear import units_to_read
 
-        units = {} if self.mechanism is None else output_units(self.mechanism)
-        channels = _channels(self.outputs or (), tuple(units))
-        if self.mechanism is not None and self.mechanism.units.input != "V":
-            units |= {self.input or "voltage": self.mechanism.units.input}
+        units = {} if self.mechanism is None else units_to_read(self.mechanism)
+        channels, told = _channels(self.outputs or (), self.mechanism.channels if self.mechanism else ())
+        units |= told
+        # Without --input the column of the voltage is read, which is not the input of such a model.
+        if self.input is not None and self.mechanism is not None and self.mechanism.units.input != "V":
+            units |= {self.input: self.mechanism.units.input}
         return {
             "input": self.input,
             "outputs": channels,
@@ -157,7 +163,7 @@ class Columns:
         from rotflex_jax.joints.rotary_flexible import SENSORS
 
         if self.outputs:
-            found = [text.partition("=")[0] for text in self.outputs]
+            found = [_name_and_unit(text.partition("=")[0])[0] for text in self.outputs]
             return found[0] if len(found) == 1 and found[0] in SENSORS else None
         try:
             table = read_table(file)
@@ -253,14 +259,37 @@ def _period(text: str | None) -> float | str | None:
         ) from None
 
 
-def _channels(outputs: Sequence[str], model: Sequence[str]) -> Sequence[str] | Mapping[str, str] | None:
-    """`theta=servo` names the channel too; plain column names come in the order of the model's channels."""
+def _channels(
+    outputs: Sequence[str], model: Sequence[str]
+) -> tuple[Sequence[str] | Mapping[str, str] | None, dict[str, str]]:
+    """Columns of the channels, and units that the options give.
+
+    `theta=servo` names the channel too, `theta [deg]=servo` also its unit. Plain names of columns come in the
+    order of the model's channels.
+    """
     if outputs and all("=" in text for text in outputs):
-        return dict(text.split("=", 1) for text in outputs)
+        columns, units = {}, {}
+        for text in outputs:
+            said, column = text.split("=", 1)
+            channel, unit = _name_and_unit(said)
+            if channel in columns:
+                raise InputError(
+                    f"--output was given the channel {channel!r} for {columns[channel]!r} and for "
+                    f"{column!r}, but a channel has one column; leave one of the two out."
+                )
+            columns[channel] = column
+            units |= {channel: unit} if unit else {}
+        return columns, units
     if not outputs and model:
-        return dict(zip(model, model, strict=True))
+        return dict(zip(model, model, strict=True)), {}
     named = model and len(outputs) == len(model)
-    return dict(zip(model, outputs, strict=True)) if named else outputs or None
+    return dict(zip(model, outputs, strict=True)) if named else outputs or None, {}
+
+
+def _name_and_unit(text: str) -> tuple[str, str]:
+    from rotflex_jax.recording.samples import name_and_unit
+
+    return name_and_unit(text)
 
 
 def _signals(texts: Sequence[str], model: Sequence[str]) -> Sequence[str] | Mapping[str, str] | None:
@@ -286,23 +315,6 @@ def _signals(texts: Sequence[str], model: Sequence[str]) -> Sequence[str] | Mapp
             )
         columns[name] = column
     return columns
-
-
-def as_options(sentence: str) -> str:
-    """A sentence about arguments of `rotflex_jax.load`, in terms of the options of the command line."""
-    sentence = re.sub(r"accept=\('(\w+)',\)", r"--accept \1", sentence)
-    sentence = sentence.replace("degrees=True", "--degrees").replace("degrees=False", "no --degrees")
-    sentence = sentence.replace("arm_absolute=True", "--arm-absolute")
-    sentence = re.sub(r"\btime_unit='(\w+)'", r"--time-unit \1", sentence)
-    sentence = re.sub(r"\btime_unit=(?!')", "--time-unit", sentence)
-    sentence = re.sub(r"\bresample='?(\w+)'?", r"--resample \1", sentence)
-    sentence = re.sub(r"\bcounts=\{'(\w+)': (\d+)\}", r"--counts \1=\2", sentence)
-    sentence = re.sub(r"\b(input|time|Ts|counts)=(?=\d)", r"--\1 ", sentence)
-    sentence = re.sub(r"\b(input|time|Ts)=", r"--\1", sentence)
-    sentence = re.sub(r"\boutputs=|Argument `outputs`", "--output", sentence)
-    sentence = re.sub(r"\bsignals=|Argument `signals`", "--signal", sentence)
-    sentence = re.sub(r"a mapping such as \{'([^']+)': '(\w+)'\}", r'for instance "\1=\2"', sentence)
-    return re.sub(r"Argument `(\w+)`", lambda m: "--" + m[1].replace("_", "-"), sentence)
 
 
 def public_name(file: Path) -> str | None:

@@ -20,7 +20,7 @@ def reproduce(
     grey_box: given.GreyBox = False,
     changes: given.Changes = None,
     listed: given.ListSettings = False,
-    joint: given.JointName = "paper",
+    joints: given.JointNames = None,
     held_out: given.HeldOut = None,
     split: given.Share = None,
     json_file: given.JsonFile = None,
@@ -49,6 +49,7 @@ def reproduce(
         )
     share = given.check_split(split, held_out or [])
     given.check_writable(json_file=json_file, folder=out)
+    joint = given.one_model(joints)
     mechanism = by_name.joint(joint)
     parts = _recordings(columns, data or [], held_out or [], share)
     if parts and joint == "paper" and data == ["rotflex"]:

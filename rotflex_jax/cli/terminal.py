@@ -16,6 +16,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from rotflex_jax.cli.arguments import as_options
 from rotflex_jax.text.files import write_file
 from rotflex_jax.text.numbers import digits, one_line, printable, readable, spreadsheet_cell
 
@@ -220,7 +221,7 @@ def print_comparison(result: Any) -> None:
     console.print(str(result), markup=False)
 
 
-def print_fleet(result: Any, reworded: Callable[[str], str]) -> None:
+def print_fleet(result: Any) -> None:
     """Print one line for each recording, and the counts."""
     good = [row for row in result.rows if row.verdict]
     rows = [
@@ -239,7 +240,7 @@ def print_fleet(result: Any, reworded: Callable[[str], str]) -> None:
     errors = [f"{channel} [{readable(1.0, unit)[1]}]" for channel, unit in result.units.items()]
     print_rows(("recording", "verdict", "found", *errors, "s"), rows)
     for row in result.failed[:LISTED_RECORDINGS]:
-        message(f"{row.name} failed: {reworded(row.reason)}")
+        message(f"{row.name} failed: {as_options(row.reason)}")
     if len(good) > LISTED_RECORDINGS or len(result.failed) > LISTED_RECORDINGS:
         message(f"The rest of the list is in {result.folder / 'summary.csv'}.")
     message(str(result))
@@ -254,7 +255,7 @@ def print_findings(recordings: Sequence[Any]) -> None:
             if finding.severity != "note" and key not in seen:
                 seen.add(key)
                 where = f"{recording.source}: " if recording.source else ""
-                message(f"Look at {where}{finding.message}", error=True)
+                message(f"Look at {where}{as_options(finding.message)}", error=True)
 
 
 def print_recording(recording: Any) -> None:
@@ -273,7 +274,7 @@ def print_recording(recording: Any) -> None:
         rows.append((name, readable(1.0, unit)[1], *limits, step))
     print_rows(("signal", "unit", "from", "to", "step"), rows)
     for finding in recording.findings:
-        message(f"{finding.severity}: {finding}")
+        message(f"{finding.severity}: {as_options(finding.message)}")
 
 
 def print_remarks(fitted: Any, label: str = "", *, error: bool = False) -> None:

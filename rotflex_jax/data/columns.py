@@ -10,8 +10,15 @@ from jaxtyping import Real
 from rotflex_jax.checks import real, shown
 from rotflex_jax.data.tables import Table, name_and_unit
 from rotflex_jax.errors import InputError
-from rotflex_jax.recording.quality import SLOWEST_SAMPLING, Finding, whole_numbers
-from rotflex_jax.recording.samples import even_spacing, finite, real_numbers, sampling_period
+from rotflex_jax.recording.quality import SLOWEST_SAMPLING, Finding, is_absolute, whole_numbers
+from rotflex_jax.recording.samples import (
+    DEGREES,
+    even_spacing,
+    finite,
+    in_radians,
+    real_numbers,
+    sampling_period,
+)
 
 OTHER_NAMES = {"t": ("time",), "theta": ("θ",), "alpha": ("α",)}
 """Other accepted names of the columns of the joint."""
@@ -33,10 +40,9 @@ TIME_WORDS = {
 }
 """Other spellings of units of time."""
 
-ANGLE_UNITS = {
-    "rad": {"rad", "rads", "radian", "radians"},
-    "deg": {"deg", "degs", "degree", "degrees", "°"},
-}
+ANGLE_UNITS = {"rad": {"rad", "rads", "radian", "radians"}, "deg": set(DEGREES)}
+INPUT_UNITS = {"V": {"v", "volt", "volts", "voltage"}, "A": {"a", "amp", "ampere", "amperes"}} | ANGLE_UNITS
+"""Unit of an input -> its spellings in lower case."""
 
 
 def unused_sensors(table: Table, channels: Sequence[str], used: set[str]) -> list[Finding]:
@@ -50,8 +56,8 @@ def unused_sensors(table: Table, channels: Sequence[str], used: set[str]) -> lis
     sensors = [c for c in JOINT_SENSORS if c in left or c in channels]
     others = ", ".join(map(repr, left.values()))
     message = (
-        f"{table.label}: {channels[0]} alone is read, though the file has {others} too; for a search with "
-        f"all of them give a joint with these sensors, --joint paper:sensors={'+'.join(sensors)}."
+        f"The file has {others} too, but {channels[0]} is the only output that is read; to use all of them "
+        f"give a model that has them as outputs, such as --joint paper:sensors={'+'.join(sensors)}."
     )
     return [Finding("unused", next(iter(left)), message, "warning")]
 
@@ -66,7 +72,14 @@ def named_outputs(outputs: Any) -> dict[str, str]:
     else:
         names = list(outputs) if isinstance(outputs, list | tuple) else [outputs]
         chosen = dict(zip(("theta", "alpha"), names, strict=False)) if len(names) <= 2 else {}
-    if not chosen or len(set(map(str, chosen.values()))) < len(chosen):
+    columns = list(chosen.values())
+    twice = [column for k, column in enumerate(columns) if column in columns[:k]]
+    if twice:
+        raise InputError(
+            f"Argument `outputs` has one column, {shown(twice[0])}, for two channels; name another for "
+            "one of them, or leave one channel out."
+        )
+    if not chosen:
         raise InputError(
             f"Argument `outputs` must name the column of theta, then that of alpha, but is "
             f"{outputs!r}; for other channels give a mapping such as {{'position': 'column'}}."
@@ -131,21 +144,42 @@ def _words(table: Table, name: str) -> set[str]:
 
 def _as_written(table: Table, name: str, word: str) -> str:
     """A word of a name or of its unit in its original spelling."""
-    said = re.search(rf"(?<![a-z°]){re.escape(word)}(?![a-z°])", f"{name} {table.units.get(name, '')}", re.I)
-    return said[0] if said else word
+    return _word_in(word, f"{name} {table.units.get(name, '')}") or word
+
+
+def _word_in(word: str, text: str) -> str:
+    """A word in the spelling of the text; empty if the text does not have it."""
+    said = re.search(rf"(?<![^\W\d_]){re.escape(word)}(?![^\W\d_])", text, re.I)
+    return said[0] if said else ""
 
 
 def _unit_source(name: str, unit: str) -> str:
     """Where the unit of a column comes from."""
-    return "name" if unit in name.lower() else "line of units"
+    return "name" if _word_in(unit, name) else "line of units"
 
 
-def input_unit(table: Table, name: str) -> str | None:
-    """The unit of the input, if the file has a unit other than volts for it."""
-    unit = _unit(table, name)
-    if not unit and "current" in _words(table, name):
-        return "A"
-    return None if unit.lower() in ("", "v", "volt", "volts", "-", "–", "1") else unit
+def input_unit(table: Table, name: str, given: str | None, any_unit: bool) -> str | None:
+    """The unit of the input, if it is not volts: the unit that was given, or else that of the file.
+
+    Raises:
+        InputError: The two are not the same unit.
+    """
+    unit, words = _unit(table, name), _words(table, name)
+    source = _unit_source(name, unit)
+    if unit.lower() in ("", "-", "–", "1"):
+        unit, source = "A" if "current" in words else "V" if words & INPUT_UNITS["V"] else "", "name"
+    said = _spelled(unit)
+    if given and said and said != _spelled(given) and not any_unit:
+        raise InputError(
+            f"{table.label}: column {name!r} is in {unit} by its {source}, but an input in {given} is "
+            f"needed; name its column with input=, or pass accept=('units',) if it is this one."
+        )
+    return given or (None if said in ("", "V") else unit)
+
+
+def _spelled(unit: str) -> str:
+    """A unit of an input in one spelling."""
+    return next((one for one, spellings in INPUT_UNITS.items() if unit.lower() in spellings), unit)
 
 
 def counts_per_turn(counts: Any, channels: Sequence[str], degrees: bool) -> dict[str, float]:
@@ -153,11 +187,6 @@ def counts_per_turn(counts: Any, channels: Sequence[str], degrees: bool) -> dict
     if counts is None:
         return {}
     each: dict[str, Any] = dict(counts) if isinstance(counts, Mapping) else dict.fromkeys(channels, counts)
-    if degrees and not isinstance(counts, Mapping):
-        raise InputError(
-            f"Arguments counts={counts} and degrees=True were both given, but a column holds one of the two; "
-            "give one, or the counts of the channels that have them, such as counts={'theta': 4096}."
-        )
     for channel, value in each.items():
         if channel not in channels:
             raise InputError(
@@ -169,57 +198,113 @@ def counts_per_turn(counts: Any, channels: Sequence[str], degrees: bool) -> dict
                 f"Argument `counts` must be the counts of one turn, a number from 1 on, but is {shown(value)}"
                 "; give for instance 4096, four times the lines of an encoder that is counted at every edge."
             )
+    if degrees and not isinstance(counts, Mapping):
+        raise InputError(
+            f"Arguments counts={real(counts):g} and degrees=True were both given, but a column holds one of "
+            "the two; give one, or the counts of the channels that have them, such as counts={'theta': 4096}."
+        )
     return {channel: float(value) for channel, value in each.items()}
 
 
-def angle(
+def output(
     table: Table,
     channel: str,
     name: str,
     values: Real[np.ndarray, " N"],
+    unit: str | None,
     degrees: bool,
     counts: float | None,
     accepted: Sequence[str],
-) -> Real[np.ndarray, " N"]:
-    """An output in radians: converted from counts or degrees, or unchanged."""
+) -> tuple[Real[np.ndarray, " N"], str]:
+    """An output and its unit: angles and speeds in degrees or counts are converted, all else is unchanged.
+
+    Args:
+        table: Table with the column.
+        channel: Name of the channel.
+        name: Name of the column.
+        values: The column.
+        unit: Unit of the channel that the user gives, if any.
+        degrees: Whether the user gives all outputs in degrees.
+        counts: Counts per turn that the user gives for this channel, if any.
+        accepted: Faults that the user accepts.
+    """
+    label = f"{table.label}: column {name!r}"
+    turned = None if unit is None else in_radians(unit)
+    if unit is not None and not (turned or unit.startswith("rad")):
+        if degrees or counts is not None:
+            raise InputError(
+                f"{label} was to be converted to rad, but its unit is given as "
+                f"{unit!r}; leave out the unit, or the conversion (degrees, counts)."
+            )
+        return values, unit
     if counts is not None:
-        return values * (2 * np.pi / counts)
-    behind = set(re.split(r"[^a-z°]+", name_and_unit(name)[1].lower()))
-    if behind & ANGLE_UNITS["deg"]:  # the header has the unit right after the name
-        degrees = True
-    else:
-        _check_angle_unit(table, name, degrees)
-    if degrees and whole_numbers(values) and "units" not in accepted:
+        if turned:
+            raise InputError(
+                f"{label} was given in {unit} and as counts={counts:g} of one turn, but holds one of the "
+                "two; leave one of the two out."
+            )
+        return values * (2 * np.pi / counts), unit or "rad"
+    in_rad = unit in ANGLE_UNITS["rad"]  # a speed in rad/s may also be converted by the file or by `degrees`
+    if degrees and in_rad:
+        raise InputError(
+            f"{label} was given in {unit}, but degrees=True was given too, which is for all outputs; leave "
+            "degrees=True out, and give the unit of each output in degrees, such as units={'theta': 'deg'}."
+        )
+    said, source = _angle_unit(table, name)
+    if said == "rad" and degrees:
+        raise InputError(
+            f"{label} is in rad by its {source}, but degrees=True was given, which is for all outputs; leave "
+            "degrees=True out, and give the unit of each output in degrees, such as units={'theta': 'deg'}."
+        )
+    if (said == "rad" and turned) or (said == "deg" and in_rad):
+        raise InputError(
+            f"{label} is in {said} by its {source}, but was given in {unit}; leave out that unit, or correct "
+            "what the file says."
+        )
+    if not (turned or degrees or said == "deg"):
+        return values, unit or "rad"
+    if whole_numbers(values) and "units" not in accepted:
         # In degrees, no encoder of a joint would be so coarse, and no arm would deflect so far.
         most = 90.0 if channel == "alpha" else 1000.0
         if np.ptp(values) > most:
             raise InputError(
-                f"{table.label}: column {name!r} holds whole numbers from {values.min():g} to "
-                f"{values.max():g}, as the counts of an encoder are, but degrees=True was given; give the "
-                "counts of one turn in its place, counts=4096 for instance, or accept=('units',)."
+                f"{label} holds whole numbers from {values.min():g} to {values.max():g}, as the counts of an "
+                "encoder are, but was to be converted from degrees; give the counts of one turn in the place "
+                "of degrees, counts=4096 for instance, or accept=('units',)."
             )
-    return np.deg2rad(values) if degrees else values
+    return np.deg2rad(values), turned or unit or "rad"
 
 
-def deflection(y: dict[str, Real[np.ndarray, " N"]]) -> dict[str, Real[np.ndarray, " N"]]:
-    """The outputs with the absolute angle of the arm converted to its deflection relative to the hub."""
+def _angle_unit(table: Table, name: str) -> tuple[str | None, str]:
+    """Unit of an angle, "deg" or "rad", by the unit in the file or else by the name; and where it is said."""
+    for words in (set(re.split(r"[^a-z°]+", _unit(table, name).lower())), _words(table, name)):
+        said = [unit for unit, spellings in ANGLE_UNITS.items() if words & spellings]
+        if len(said) == 1:
+            return said[0], _unit_source(name, min(words & ANGLE_UNITS[said[0]]))
+    return None, ""
+
+
+def deflection(
+    y: dict[str, Real[np.ndarray, " N"]], label: str, accepted: Sequence[str]
+) -> dict[str, Real[np.ndarray, " N"]]:
+    """The outputs with the absolute angle of the arm converted to its deflection relative to the hub.
+
+    Raises:
+        InputError: theta or alpha is missing, or alpha was the deflection already.
+    """
     if not {"theta", "alpha"} <= set(y):
         raise InputError(
             f"Argument arm_absolute=True needs the channels theta and alpha, but the outputs are "
             f"{', '.join(y)}; leave it out, or name both."
         )
-    return {channel: x - y["theta"] if channel == "alpha" else x for channel, x in y.items()}
-
-
-def _check_angle_unit(table: Table, name: str, degrees: bool) -> None:
-    given, other = ("deg", "rad") if degrees else ("rad", "deg")
-    words = _words(table, name)
-    if words & ANGLE_UNITS[other] and not words & ANGLE_UNITS[given]:
-        word = min(words & ANGLE_UNITS[other])
+    bent = y["alpha"] - y["theta"]
+    if "absolute" not in accepted and is_absolute(y["theta"], -bent):
         raise InputError(
-            f"{table.label}: column {name!r} is in {other} by its {_unit_source(name, word)}, but "
-            f"degrees={degrees} was given; pass degrees={not degrees}, or correct what the file says."
+            f"{label}: alpha less theta follows -theta one to one in slow motion, so that alpha held the "
+            "deflection already, but arm_absolute=True was given; leave arm_absolute=True out, or pass "
+            "accept=('absolute',)."
         )
+    return y | {"alpha": bent}
 
 
 def time_stamps(
@@ -231,8 +316,13 @@ def time_stamps(
             f"Argument `time_unit` must be one of {', '.join(TIME_UNITS)}, but is {time_unit!r}; give "
             "for instance time_unit='ms'."
         )
-    behind = name_and_unit(name)[1].lower()
-    unit = time_unit or TIME_WORDS.get(behind, behind if behind in TIME_UNITS else None)
+    said, source = _time_unit(table, name, by_name=not any_unit)
+    if time_unit is not None and said not in (None, time_unit):
+        raise InputError(
+            f"{table.label}: column {name!r} is in {said} by its {source}, but time_unit={time_unit!r} was "
+            f"given; pass time_unit={said!r}, or correct what the file says."
+        )
+    unit = time_unit or said
     t = column_of(table, name, "time=", {} if any_unit or unit else {"ms": "seconds"})
     if len(t) != samples:
         raise InputError(
@@ -240,6 +330,16 @@ def time_stamps(
             "needs one; name the right column with time=."
         )
     return t.astype(float) * TIME_UNITS[unit] if unit and unit != "s" else t.astype(float)
+
+
+def _time_unit(table: Table, name: str, by_name: bool) -> tuple[str | None, str]:
+    """Unit of a time by the unit in the file, or by the last word of the name; and where it is said."""
+    last = re.findall(r"[^\W\d_]+", name_and_unit(name)[0].lower())[-1:] if by_name else []
+    for word in (_unit(table, name).lower(), *last):
+        unit = TIME_WORDS.get(word, word if word in TIME_UNITS else None)
+        if unit is not None:
+            return unit, _unit_source(name, word)
+    return None, ""
 
 
 def timing(

@@ -20,13 +20,13 @@ from rotflex_jax.data.binary import (
 )
 from rotflex_jax.data.columns import (
     OTHER_NAMES,
-    angle,
     column_of,
     counts_per_turn,
     deflection,
     input_unit,
     named_outputs,
     named_signals,
+    output,
     time_stamps,
     timing,
     unused_sensors,
@@ -130,6 +130,7 @@ def _together(sources: Sequence[Any], label: str, max_bytes: int, time: str | No
     units: set[str] = set()
     channels: list[Channel] = []
     alone: list[str | None] = []  # names of files with one channel
+    file_of: dict[tuple[str, str], Path] = {}
     for path, table in zip(paths, tables, strict=True):
         clock = table.find(time or "t", *(() if time else OTHER_NAMES["t"]))
         own = [name for name in table.columns if name != clock]
@@ -144,6 +145,13 @@ def _together(sources: Sequence[Any], label: str, max_bytes: int, time: str | No
             # Files with equal times share their clock.
             group = next((g for g, other in clocks.items() if np.array_equal(t, other)), group)
             clocks.setdefault(group, t)
+        for name in own:
+            other = file_of.setdefault((group, name), path)
+            if other != path and len(own) > 1:
+                raise InputError(
+                    f"{other.name} and {path.name} both have the channel {name!r}, but one recording has "
+                    "each channel once; give one file alone, or give the channels different names."
+                )
         channels += [Channel(group, name, table.units.get(name, ""), table.columns[name]) for name in own]
         alone += [path.stem] if len(own) == 1 else [None] * len(own)
     if len(units) > 1:
@@ -241,12 +249,12 @@ def load(
             DataFrame; or an object with `u` and `y`.
         input: column of the motor voltage [V].
         outputs: columns of theta, then of alpha [rad]; or a mapping of channel name to column.
-        degrees: whether the outputs are in degrees.
+        degrees: whether all outputs are in degrees; for one of several give `units`.
         Ts: sampling period [s], if no column has the time.
         time: column of the time [s].
         accept: faults to accept by name, such as `saturated`; see `Recording`.
-        units: mapping of channel to unit, for units other than rad; and of the column of the input to its
-            unit, if that is not V.
+        units: mapping of channel to unit, for units other than rad; `deg` and `deg/s` are converted to rad
+            and rad/s. Also of the column of the input to its unit, if that is not V.
         max_bytes: largest size of the file, packed and unpacked [bytes].
         counts: counts per turn, if the outputs are counts of an encoder; or a mapping of channel to counts
             per turn, where the other channels are angles.
@@ -270,8 +278,11 @@ def load(
     >>> frame = pd.DataFrame({"t": k / 50, "volts": np.sin(k), "theta": 0.01 * np.cos(k)})
     >>> load(frame, input="volts", outputs="theta")
     Recording(100 samples, 2 s at 50 Hz, voltage [V] to theta [rad], DataFrame)
-    >>> load(frame, input="volts", outputs="theta", units={"volts": "rad"})
-    Recording(100 samples, 2 s at 50 Hz, volts [rad] to theta [rad], DataFrame)
+    >>> goal = frame.rename(columns={"volts": "goal"})
+    >>> load(goal, input="goal", outputs="theta", units={"goal": "rad"})
+    Recording(100 samples, 2 s at 50 Hz, goal [rad] to theta [rad], DataFrame)
+    >>> load(frame, input="volts", outputs="theta", units={"theta": "deg"}).y[0]
+    array([0.00017453])
     >>> turned = pd.DataFrame({"Time [ms]": 20 * k, "Voltage [V]": np.sin(k), "Theta [deg]": np.cos(k)})
     >>> load(turned, outputs="theta").y[0]
     array([0.01745329])
@@ -327,22 +338,13 @@ def load(
     u = column_of(table, u_name, "input=", {"mv": "volts"})
     held = [u, *(column_of(table, name, "signals=", {}) for name in acting.values())]
     per_turn = counts_per_turn(counts, tuple(chosen), degrees)
-    y, in_radians = {}, set()  # channels that have been converted
+    y, unit_of, turned = {}, {}, set()  # the last: channels that have been converted
     for channel, name in chosen.items():
         values = column_of(table, name, "outputs=", {})
-        per = per_turn.get(channel)
-        unit = (units or {}).get(channel, "rad")
-        if unit.startswith("rad"):
-            y[channel] = angle(table, channel, name, values, degrees, per, accepted)
-            if y[channel] is not values:
-                in_radians.add(channel)
-        elif degrees or per is not None:
-            raise InputError(
-                f"{table.label}: column {name!r} was to be converted to rad, but its unit is given as "
-                f"{unit!r}; leave out the unit, or the conversion (degrees, counts)."
-            )
-        else:
-            y[channel] = values
+        told = (units or {}).get(channel), degrees, per_turn.get(channel)
+        y[channel], unit_of[channel] = output(table, channel, name, values, *told, accepted)
+        if y[channel] is not values:
+            turned.add(channel)
     for name, values in zip(names, [*held, *y.values()], strict=True):
         if len(values) != len(u) and not apart:
             raise InputError(
@@ -350,7 +352,7 @@ def load(
                 f"{len(values)}, but they must be measured together; cut both to the same ones."
             )
     if arm_absolute:
-        y = deflection(y)
+        y = deflection(y, table.label, accepted)
     remarks = unused_sensors(table, tuple(y), {clock, *names})
     if apart:
         if resample is None:
@@ -388,7 +390,8 @@ def load(
     # A user who gives the unit of the time means a long period; a column of times has been checked above.
     seconds = period >= SLOWEST_SAMPLING and (time_unit is not None or "units" in accepted)
     try:
-        other = (units or {}).get(u_name) or input_unit(table, u_name)
+        driven_in = (units or {}).get(u_name) or (units or {}).get("voltage" if input is None else input)
+        other = input_unit(table, u_name, driven_in, "units" in accepted)
         recording = Recording(
             u=held[0],
             input_name="voltage" if other is None else name_and_unit(u_name)[0],
@@ -396,7 +399,7 @@ def load(
             y=together,
             Ts=period,
             channels=tuple(y),
-            units=tuple((units or {}).get(channel, "rad") for channel in y),
+            units=tuple(unit_of[channel] for channel in y),
             source=table.label,
             start=start,
             accept=(*accepted, "slow") if seconds and "slow" not in accepted else accepted,
@@ -408,7 +411,7 @@ def load(
     for finding in recording.findings:
         # Columns of a file are less certain than arrays, whose meaning the calling program knows.
         if finding.kind in DOUBTED and finding.kind not in accepted:
-            told = converted(finding) if finding.channel in in_radians else finding
+            told = converted(finding) if finding.channel in turned else finding
             raise InputError(f"{table.label}: {told.message}")
     if table.cut:  # a finding on the file, not on parts of the recording
         cut = Finding("cut", [*table.columns][-1], table.cut, "note")

@@ -14,6 +14,7 @@ from jaxtyping import Float, Shaped
 from rotflex_jax.errors import InputError
 from rotflex_jax.recording.quality import Finding
 from rotflex_jax.recording.samples import LONGEST_STEP, finite, name_and_unit, sampling_period
+from rotflex_jax.text.files import is_search_result
 
 
 @dataclass(frozen=True)
@@ -94,15 +95,26 @@ class Table:
             raise self._lacks(f"columns {names}", f"name the right ones with {listed}")
 
     def _lacks(self, what: str, then: str) -> InputError:
-        longer = [key for key, values in self.columns.items() if len(values) > 1]
-        there = longer or list(self.columns)  # single values are settings, not signals
-        short = [name if len(name) <= 40 else f"{name[:37]}..." for name in there[:20]]
-        names = ", ".join(short) + (f" and {len(there) - 20} more" if len(there) > 20 else "")
-        objects = ", ".join(f"{name} ({kind})" for name, kind in [*self.objects.items()][:5])
+        longest = max(map(len, self.columns.values()), default=0)
+        signals = [key for key, values in self.columns.items() if len(values) == longest]
+        # Single values are settings, and shorter arrays often matrices: both come behind the signals.
+        there = signals + [key for key, values in self.columns.items() if 1 < len(values) < longest]
+        most = max(20, min(len(signals), MOST_LISTED))
+        short = [name if len(name) <= 40 else f"{name[:37]}..." for name in there[:most]]
+        names = ", ".join(short) + (f" and {len(there) - most} more" if len(there) > most else "")
+        texts = ", ".join(name for name, kind in self.objects.items() if kind == "string")
+        if texts:
+            then += f"; {texts:.200} (MATLAB strings) cannot be read and are not needed"
+        others = [(name, kind) for name, kind in self.objects.items() if kind != "string"]
+        objects = ", ".join(f"{name} ({kind})" for name, kind in others[:5])
         if objects:
             cure = "save a timetable, timeseries or Dataset with -v7, and of others the arrays"
             then += f"; objects that only MATLAB reads are left out, {objects}: {cure}"
         return InputError(f"{self.label} has no {what}; it has {names or 'none'}: {then}.")
+
+
+MOST_LISTED = 60
+"""Largest number of columns in the message on one that is missing."""
 
 
 def distinct(names: Sequence[str], label: str) -> Sequence[str]:
@@ -209,6 +221,10 @@ def table_from_json(path: Path, max_bytes: int = MAX_BYTES) -> Table:
         if isinstance(error, InputError):
             raise
         raise unreadable(path, "JSON", error) from error
+    if is_search_result(data):
+        raise InputError(
+            f"{path.name} is the result of a search, not a recording; give the recording itself."
+        )
     named = data if isinstance(data, dict) else {"": data}
     lists = {name: v for name, v in named.items() if _are_samples(v)}
     if len(lists) > 1:

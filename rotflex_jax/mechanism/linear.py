@@ -56,6 +56,11 @@ def output_units(mechanism: Mechanism) -> dict[str, str]:
     return dict(zip(mechanism.channels, units, strict=True))
 
 
+def units_to_read(mechanism: Mechanism) -> dict[str, str]:
+    """Channel -> unit, for outputs that are not in rad, which `rotflex_jax.load` takes unless it is told."""
+    return {channel: unit for channel, unit in output_units(mechanism).items() if unit != "rad"}
+
+
 class StateSpace(NamedTuple):
     """`x' = A x + B u, y = C x`; the state is positions, speeds, then linear states of effects."""
 

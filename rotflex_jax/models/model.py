@@ -16,13 +16,14 @@ from rotflex_jax.errors import InputError
 from rotflex_jax.mechanism import Exponential, Mechanism, Solver, free_run, kalman_gains, predictor_run
 from rotflex_jax.mechanism.assembly import effects_of, motor_voltage, rest_state
 from rotflex_jax.mechanism.initial_state import initial_states
-from rotflex_jax.mechanism.linear import check_movable
+from rotflex_jax.mechanism.linear import check_movable, output_units
 from rotflex_jax.mechanism.mechanism import check_mechanism, process_noise_of
 from rotflex_jax.mechanism.simulate import first_state
 from rotflex_jax.metrics import window_starts
 from rotflex_jax.recording import Recording
 from rotflex_jax.recording.quality import ACCEPTABLE
 from rotflex_jax.recording.recording import single
+from rotflex_jax.recording.samples import in_radians
 from rotflex_jax.runtime.persistent_jit import PersistentJit, persistent_jit
 from rotflex_jax.runtime.xla import double_precision
 
@@ -158,9 +159,16 @@ class Model:
         if missing:
             raise InputError(
                 f"The model has the outputs {', '.join(self.mechanism.channels)}, but the recording "
-                f"has the channels {', '.join(recording.channels)}; give the recording these "
-                f"channel names, or the model these outputs."
+                f"has the channels {', '.join(recording.channels)}; name the column of {missing[0]}, "
+                f"outputs={{{missing[0]!r}: 'COLUMN'}}, or give a model with the outputs of the recording."
             )
+        for channel, unit in output_units(self.mechanism).items():
+            if in_radians(recording.unit(channel)) and unit.startswith("rad"):
+                raise InputError(
+                    f"Channel {channel!r} of the recording is in {recording.unit(channel)}, but the output "
+                    f"{channel} of the model is in {unit}; convert it (numpy.deg2rad), or load the file with "
+                    f"units={{{channel!r}: {recording.unit(channel)!r}}}, which converts it."
+                )
         return np.stack([recording.channel(c) for c in self.mechanism.channels], axis=1)
 
     def inputs(self, recording: Recording) -> Float[np.ndarray, "N *c"]:

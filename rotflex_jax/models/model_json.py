@@ -21,11 +21,12 @@ from rotflex_jax.mechanism.intersample import Intersample
 from rotflex_jax.mechanism.quantity import Units
 from rotflex_jax.models.model import Model
 from rotflex_jax.parameters import Estimate, HeldConstant, specifications
-from rotflex_jax.text.files import path_of, write_file
+from rotflex_jax.text.files import is_search_result, path_of, write_file
 from rotflex_jax.text.numbers import json_number
 
 SCHEMA = 1
 KIND = "rotflex_jax model"
+WRITTEN = "`model.save` or `--save-model` has written"
 LARGEST_FILE = 50_000_000
 """Largest size of a file that is read as a model file [bytes]."""
 
@@ -86,9 +87,7 @@ def read(path: str | os.PathLike[str]) -> Saved:
     path = path_of(path)
     try:
         if os.path.getsize(path) > LARGEST_FILE:
-            raise InputError(
-                f"{path} is too large for a model file; give a file that `model.save` has written."
-            )
+            raise InputError(f"{path} is too large for a model file; give a file that {WRITTEN}.")
         data = json.loads(Path(path).read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise InputError(f"{path} does not exist; give the path of a model file.") from None
@@ -99,9 +98,11 @@ def read(path: str | os.PathLike[str]) -> Saved:
     except InputError:
         raise
     except (ValueError, RecursionError, MemoryError):  # no JSON, no UTF-8, or a whole number of 5,000 digits
-        raise InputError(f"{path} is not JSON; give a file that `model.save` has written.") from None
+        raise InputError(f"{path} is not JSON; give a file that {WRITTEN}.") from None
     if not isinstance(data, dict) or data.get("kind") != KIND:
-        raise InputError(f"{path} is no model file; give a file that `model.save` has written.")
+        searched = is_search_result(data)
+        what = "is the result of a search, not a model file" if searched else "is no model file"
+        raise InputError(f"{path} {what}; give a file that {WRITTEN}.")
     try:
         return from_dict(data)
     except InputError as error:

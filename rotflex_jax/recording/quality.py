@@ -337,7 +337,7 @@ def _slow(Ts: float, units: Sequence[str]) -> Finding | None:
     if Ts < SLOWEST_SAMPLING or "rad" not in units:
         return None
     message = (
-        f"The sampling period was given as {Ts:g} s, too slow for a joint: it looks like milliseconds; "
+        f"The sampling period is {Ts:g} s, too slow for a joint: it looks like milliseconds; "
         f"pass Ts={Ts / 1000:g}, or accept=('slow',) if these are seconds."
     )
     return Finding("slow", "time", message, "error")

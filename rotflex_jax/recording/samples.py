@@ -18,6 +18,10 @@ SAME_PERIOD = 1e-6
 LONGEST_STEP = 5.0
 
 
+MISSING = "cut the recording there (docs/load_data.md shows how), since nothing is filled in"
+"""What to do about a value that is missing."""
+
+
 def real_numbers(values: Any, label: str, where: str = "sample", first: int = 0) -> Real[np.ndarray, "..."]:
     """An array of real numbers; text is parsed strictly.
 
@@ -55,9 +59,9 @@ def real_numbers(values: Any, label: str, where: str = "sample", first: int = 0)
         except (TypeError, ValueError, OverflowError) as error:
             text = entry.decode(errors="replace") if isinstance(entry, bytes) else f"{entry!s:.50}"
             what = f"holds {text!r}" if text.strip() else "is empty"
+            cure = "correct the data, or cut them there" if text.strip() else MISSING
             raise InputError(
-                f"{label} {what} at {where} {first + k} where a number is needed; "
-                "correct the data, or cut them there."
+                f"{label} {what} at {where} {first + k} where a number is needed; {cure}."
             ) from error
     return numbers
 
@@ -72,14 +76,13 @@ def finite(x: Real[np.ndarray, " N"], label: str, where: str = "sample", first: 
     Traceback (most recent call last):
         ...
     rotflex_jax.errors.InputError: Channel 'alpha' is nan at sample 1, in 1 of 3 samples in all; \
-cut the recording there, or record again, since nothing is filled in silently.
+cut the recording there (docs/load_data.md shows how), since nothing is filled in.
     """
     bad = np.flatnonzero(~np.isfinite(x))
     if len(bad):
         raise InputError(
             f"{label} is {x[bad[0]]} at {where} {first + bad[0]}, in {len(bad)} of {len(x)} "
-            "samples in all; cut the recording there, or record again, since nothing is filled in "
-            "silently."
+            f"samples in all; {MISSING}."
         )
 
 
@@ -313,6 +316,20 @@ def name_and_unit(name: str) -> tuple[str, str]:
     """
     found = _UNIT_BEHIND.fullmatch(name.strip())
     return (found[1], found[2]) if found else (name.strip(), "")
+
+
+DEGREES = ("deg", "degs", "degree", "degrees", "°")
+"""Spellings of degrees."""
+
+
+def in_radians(unit: str) -> str | None:
+    """The unit in radians of an angle, a speed or an acceleration that is in degrees; None for other units.
+
+    >>> in_radians("deg"), in_radians("deg/s"), in_radians("rad"), in_radians("m")
+    ('rad', 'rad/s', None, None)
+    """
+    angle, slash, time = unit.partition("/")
+    return f"rad{slash}{time}" if angle.strip().lower() in DEGREES else None
 
 
 def known_signals(

@@ -24,6 +24,11 @@ def path_of(given: Any) -> Path:
     raise InputError(f"The path of a file is needed, but {shown(given)} was given; give its name as text.")
 
 
+def is_search_result(content: Any) -> bool:
+    """Whether the content of a JSON file is the result of a search, as `--json` writes it."""
+    return isinstance(content, dict) and {"verdict", "rounds", "baseline"} <= set(content)
+
+
 def without_folder(path: Path) -> InputError:
     """The error for a file whose folder does not exist."""
     return InputError(
