@@ -162,8 +162,8 @@ def yes_or_no(value: Any, name: str) -> bool:
 
 
 def entries(value: Any) -> tuple[Any, ...] | None:
-    """The entries of a sequence; None for a text, for a mapping and for a value that is no sequence."""
-    if isinstance(value, str | bytes | Mapping):
+    """The entries of a sequence; None for a text, a mapping, a table and a value that is no sequence."""
+    if isinstance(value, str | bytes | Mapping) or hasattr(value, "columns"):
         return None
     try:
         return tuple(value)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 from typing import ClassVar
 
 import numpy as np
@@ -510,7 +511,7 @@ def test_objects_that_only_matlab_reads_are_named(measured) -> None:
     from rotflex_jax.data.datasets import fetch
 
     measured("rotflex")
-    with pytest.raises(InputError, match=r"it has .*data_vm\[1\], .*; control_mode \(MATLAB strings"):
+    with pytest.raises(InputError, match=r"it has .*data_vm\[1\], .*; control_mode \(a MATLAB string"):
         rf.load(fetch("rotflex")[0])
 
 
@@ -633,3 +634,59 @@ def test_findings_name_options_of_the_command_line(run, tmp_path) -> None:  # no
     status, out, err = run("check", tmp_path / "run.csv", "--Ts", 4, "--accept", "slow", "--accept", "units")
     assert status == 0, err
     assert "warning: The sampling period is 4 s" in out and "pass --Ts 0.004, or --accept slow" in out
+
+
+def test_messages_name_the_fault_and_options_of_the_command_line(run, tmp_path) -> None:  # noqa: F811
+    file, counted = tmp_path / "run.csv", tmp_path / "counted.csv"
+    frame().to_csv(file, index=False)
+    frame(theta=np.round(651.9 * THETA), alpha=np.round(651.9 * ALPHA)).to_csv(counted, index=False)
+    found = tmp_path / "result.json"
+    found.write_text(json.dumps({"schema": 1, "verdict": "found", "baseline": {}, "rounds": [{"a": 1}]}))
+    for line, words in (
+        (("check", file, "--output", "gamma=alpha"), ("--output theta=COLUMN",)),
+        (("check", file, "--Ts", 0.004), ("leave --Ts out",)),
+        (("check", counted, "--counts", 4096, "--degrees"), ("--counts 4096 and --degrees",)),
+        (("discover", file, "--save-model"), ("rotflex discover --help",)),
+        (("simulate", file, "--model", found), ("is the result of a search", "`--save-model`")),
+        (("check", found), ("is the result of a search, not a recording",)),
+        (
+            ("check", file, "--output", "theta=alpha", "--output", "alpha=alpha"),
+            ("has one column, 'alpha', for two channels",),
+        ),
+    ):
+        status, _, err = run(*line)
+        assert status == 2, line
+        assert_one_sentence(err, *words)
+    frame(alpha=-ALPHA).to_csv(file, index=False)
+    status, _, err = run("check", file)
+    assert status == 2
+    assert_one_sentence(err, "starting values nearer to the machine, such as --joint paper:")
+
+
+def test_a_table_is_no_recording() -> None:
+    with pytest.raises(InputError, match="is a DataFrame; read a file"):
+        rf.fit(rf.joints.paper(), frame())
+
+
+def test_two_files_with_one_channel_are_not_one_recording(tmp_path) -> None:
+    for name in "AB":
+        frame().to_csv(tmp_path / f"{name}.csv", index=False)
+    with pytest.raises(InputError, match=r"A\.csv and B\.csv both have the channel 'voltage'"):
+        rf.load(tmp_path)
+
+
+def test_nan_and_an_empty_cell_have_one_remedy(tmp_path) -> None:
+    cure = "cut the recording there (docs/load_data.md shows how), since nothing is filled in"
+    hole = frame()
+    hole.loc[700, "alpha"] = np.nan
+    for word in ("nan", ""):
+        hole.to_csv(tmp_path / "run.csv", index=False, na_rep=word)
+        with pytest.raises(InputError, match=re.escape(cure)):
+            rf.load(tmp_path / "run.csv")
+
+
+def test_signals_come_first_in_the_list_of_columns(tmp_path) -> None:
+    settings = {f"setting_{k}": np.arange(3.0) for k in range(25)}
+    np.savez(tmp_path / "run.npz", **settings, u=U, servo=THETA)
+    with pytest.raises(InputError, match=r"it has u, servo, setting_0, .* and 7 more"):
+        rf.load(tmp_path / "run.npz", Ts=RECORDING.Ts)

@@ -76,7 +76,7 @@ def test_what_is_added_can_be_taken_away():
     held = more.trust("hub.coulomb.level")
     assert held.without("coulomb", "hub") == joint  # a removed parameter is no longer trusted
     assert held.release("hub.coulomb.level") == more
-    with pytest.raises(TypeError):
+    with pytest.raises(InputError, match=r"but 1\.0 was given"):
         joint + 1.0
 
 
@@ -207,3 +207,15 @@ def test_gates_do_not_trace_again():
     np.testing.assert_allclose(with_it, record.y, atol=1e-12)
     np.testing.assert_allclose(without, simulate(paper(), u, 0.01), atol=1e-12)
     assert np.abs(with_it - without).max() > 1e-3
+
+
+def test_only_an_effect_is_added() -> None:
+    joint = paper()
+    for given, words in (
+        (fx.LuGre, r"the class LuGre was given; .* rotflex_jax\.effects\.LuGre\(at='hub'\)"),
+        (fx.Delay, r"effects\.Delay\(at='input'\)"),
+        ("coulomb", r"'coulomb' was given; .*Coulomb\(at='hub'\)"),
+    ):
+        for start in (joint, Model(joint)):
+            with pytest.raises(InputError, match=words):
+                start + given  # type: ignore[operator]

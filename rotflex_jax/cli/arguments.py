@@ -47,7 +47,7 @@ OutputColumns = Annotated[
     typer.Option(
         "--output",
         metavar="COLUMN",
-        help="Column of theta, and once more for that of alpha; or CHANNEL=COLUMN, CHANNEL [deg]=COLUMN.",
+        help="Column of theta, and once more for that of alpha; or CHANNEL=COLUMN, CHANNEL [UNIT]=COLUMN.",
     ),
 ]
 Signals = Annotated[
@@ -62,7 +62,7 @@ Signals = Annotated[
 Degrees = Annotated[
     bool,
     typer.Option(
-        "--degrees", help='All angles are in degrees; for one of two, --output "theta [deg]=COLUMN".'
+        "--degrees", help='All angles are in degrees; for one of them, --output "CHANNEL [UNIT]=COLUMN".'
     ),
 ]
 SamplingPeriod = Annotated[

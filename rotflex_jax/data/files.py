@@ -389,9 +389,9 @@ def load(
         remarks.append(told)
     # A user who gives the unit of the time means a long period; a column of times has been checked above.
     seconds = period >= SLOWEST_SAMPLING and (time_unit is not None or "units" in accepted)
+    driven_in = (units or {}).get(u_name) or (units or {}).get("voltage" if input is None else input)
+    other = input_unit(table, u_name, driven_in, "units" in accepted)
     try:
-        driven_in = (units or {}).get(u_name) or (units or {}).get("voltage" if input is None else input)
-        other = input_unit(table, u_name, driven_in, "units" in accepted)
         recording = Recording(
             u=held[0],
             input_name="voltage" if other is None else name_and_unit(u_name)[0],

@@ -102,9 +102,10 @@ class Table:
         most = max(20, min(len(signals), MOST_LISTED))
         short = [name if len(name) <= 40 else f"{name[:37]}..." for name in there[:most]]
         names = ", ".join(short) + (f" and {len(there) - most} more" if len(there) > most else "")
-        texts = ", ".join(name for name, kind in self.objects.items() if kind == "string")
+        texts = [name for name, kind in self.objects.items() if kind == "string"]
         if texts:
-            then += f"; {texts:.200} (MATLAB strings) cannot be read and are not needed"
+            what, verb = ("a MATLAB string", "is") if len(texts) == 1 else ("MATLAB strings", "are")
+            then += f"; {', '.join(texts):.200} ({what}) cannot be read and {verb} not needed"
         others = [(name, kind) for name, kind in self.objects.items() if kind != "string"]
         objects = ", ".join(f"{name} ({kind})" for name, kind in others[:5])
         if objects:

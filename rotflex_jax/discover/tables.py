@@ -128,7 +128,10 @@ def error_lists(discovery: SearchResult) -> list[NamedErrors]:
     if fitted_friction(discovery):
         chose += " Friction that differs between runs was fitted to those of a run that was not trained."
     if not discovery.test:
-        chose += " Test recordings (test=), used for no fit and no choice, would give an unbiased error."
+        chose += (
+            " Test recordings (test= in Python, --test on the command line), used for no fit and no choice, "
+            "would give an unbiased error."
+        )
     tested = (last.test, last.test_calibrated) if last else (None, None)
     short, short_tested = (
         _mostly_calibrated(stages[0].calibrate_seconds, recordings, what)

@@ -287,7 +287,13 @@ class Mechanism:
     def __add__(self, effect: Effect) -> "Mechanism":
         """The mechanism with one more effect."""
         if not isinstance(effect, Effect):
-            return NotImplemented
+            kind = effect if isinstance(effect, type) and issubclass(effect, Effect) else DryFriction
+            name = "Coulomb" if kind is DryFriction else kind.__name__
+            raise InputError(
+                f"Only an effect can be added to a mechanism, but {shown(effect)} was given; give an effect "
+                f"with the place where it acts, such as rotflex_jax.effects.{name}"
+                f"(at={next(iter(self.locations(kind)), 'hub')!r})."
+            )
         return dataclasses.replace(self, effects=(*self.effects, effect))
 
     def without(self, name: str, at: str) -> "Mechanism":
