@@ -581,7 +581,13 @@ def test_one_angle_in_degrees_and_one_in_radians(run, tmp_path) -> None:  # noqa
     told = ("--output", "theta [deg]=servo", "--output", "alpha=arm")
     status, out, err = run("check", tmp_path / "plain.csv", *told)
     assert status == 0, err
-    assert out == run("check", tmp_path / "mixed.csv", *both)[1].replace("mixed.csv", "plain.csv")
+    by_name = run("check", tmp_path / "mixed.csv", *both)[1].replace("mixed.csv", "plain.csv")
+    note = "note: Column 'servo_deg' was converted from degrees because of its name.\n"
+    assert note in by_name and out == by_name.replace(note, "")
+    late = rf.load(plain.rename(columns={"t": "t_ms"}).assign(t_ms=1e3 * T), time="t_ms", outputs="arm")
+    assert [str(f) for f in late.remarks if f.kind == "converted"] == [
+        "The time 't_ms' was converted from ms because of its name."
+    ]
     milli = ("--output", "theta [mrad]=servo", "--output", "alpha=arm")
     status, _, err = run("check", tmp_path / "plain.csv", *milli)
     assert status == 2

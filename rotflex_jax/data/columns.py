@@ -342,6 +342,28 @@ def _time_unit(table: Table, name: str, by_name: bool) -> tuple[str | None, str]
     return None, ""
 
 
+def conversions_by_name(table: Table, outputs: Mapping[str, str], clock: str) -> list[Finding]:
+    """Notes on columns that were converted because of their names alone, which the file does not confirm.
+
+    Args:
+        table: Table with the columns.
+        outputs: Channel -> column, for outputs whose unit the user has not given.
+        clock: Column of the time; empty if the user has given its unit, or the sampling period.
+    """
+    notes = [
+        Finding(
+            "converted", channel, f"Column {name!r} was converted from degrees because of its name.", "note"
+        )
+        for channel, name in outputs.items()
+        if not _unit(table, name) and _angle_unit(table, name)[0] == "deg"
+    ]
+    unit = _time_unit(table, clock, by_name=True)[0] if clock and not _unit(table, clock) else None
+    if unit not in (None, "s"):
+        message = f"The time {clock!r} was converted from {unit} because of its name."
+        notes.append(Finding("converted", "time", message, "note"))
+    return notes
+
+
 def timing(
     table: Table,
     name: str,

@@ -21,6 +21,7 @@ from rotflex_jax.data.binary import (
 from rotflex_jax.data.columns import (
     OTHER_NAMES,
     column_of,
+    conversions_by_name,
     counts_per_turn,
     deflection,
     input_unit,
@@ -353,7 +354,11 @@ def load(
             )
     if arm_absolute:
         y = deflection(y, table.label, accepted)
+    unsaid = {c: name for c, name in chosen.items() if c in turned and c not in per_turn}
+    unsaid = {c: name for c, name in unsaid.items() if not degrees and c not in (units or {})}
+    read = stamps and time_unit is None and "units" not in accepted
     remarks = unused_sensors(table, tuple(y), {clock, *names})
+    remarks += conversions_by_name(table, unsaid, clock if read else "")
     if apart:
         if resample is None:
             raise InputError(
