@@ -747,7 +747,8 @@ def test_a_final_fit_gives_the_descriptions_and_notes_name_the_search(
     assert "Round 1: Coulomb friction of 0.0377 N m at the hub\n" in told
     assert "Coulomb friction of 0.0377 N m at the hub." in page
     assert f"Round 2: {discovery.rounds[1].sentence} (values of the last round; the model to use is" in told
-    for text in (told, page):
+    assert "  1. Coulomb friction of 0.0377 N m at the hub\n" in str(found)
+    for text in (told, page, found._repr_html_().replace("\xa0", " ")):
         assert "at its lower bound (last model of the search, before the final fit)." in text
         assert "Another note." in text
     assert "before the final fit" not in printed(discovery, monkeypatch, capsys)

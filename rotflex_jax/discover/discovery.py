@@ -22,10 +22,12 @@ from rotflex_jax.discover.result import NEXT, KnownRuns, SearchResult
 from rotflex_jax.discover.tables import (
     channel_headings,
     channel_units,
+    description_in_use,
     error_rows,
     estimates_in_use,
     final_fit_sentence,
     noise_row,
+    notes_in_words,
     outcomes,
     stage_labels,
     where_sentence,
@@ -61,7 +63,10 @@ class Discovery(SearchResult):
         return []
 
     def __str__(self) -> str:
-        return "\n".join(part for part in (super().__str__(), final_fit_sentence(self)) if part)
+        lines = [self.sentence]
+        lines += [f"  {i}. {description_in_use(self, r)}" for i, r in enumerate(self.rounds, 1)]
+        lines += [self.probabilities.sentence] if self.probabilities else []
+        return "\n".join(line for line in (*lines, final_fit_sentence(self)) if line)
 
     def latent_torque(self, progress: Callable[[str], None] | None = None) -> LatentTorqueComparison:
         """Torques that the baseline and the final model lack, on a fitted and a validation recording."""
@@ -287,5 +292,5 @@ class Discovery(SearchResult):
             ),
             folded("Where the baseline failed", where),
             folded("Ranking before any was added", table(("candidate", "", "score [nat]"), ranked, words=2)),
-            bullets([*([told] if (told := final_fit_sentence(self)) else []), *self.notes]),
+            bullets([*([told] if (told := final_fit_sentence(self)) else []), *notes_in_words(self)]),
         )

@@ -658,9 +658,3 @@ class SearchResult:
             "final_fit": self.final_fit.to_dict() if self.final_fit else None,
             "elapsed_s": self.elapsed_s,
         }
-
-    def __str__(self) -> str:
-        lines = [self.sentence]
-        lines += [f"  {i}. {r.sentence}" for i, r in enumerate(self.rounds, 1)]
-        lines += [self.probabilities.sentence] if self.probabilities else []
-        return "\n".join(lines)
