@@ -5,7 +5,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -109,8 +109,6 @@ class Recording:
     constants: Mapping[str, float]
     remarks: tuple[Finding, ...]
     signals: Mapping[str, Float[np.ndarray, " N"]]
-    # The recording from which `slice` and `decimate` made this one, so that parts of one run are known.
-    _whole: ClassVar["Recording | None"] = None
 
     def __init__(
         self,
@@ -261,8 +259,24 @@ class Recording:
 
     def _made(self, part: "Recording") -> "Recording":
         """A recording that was made from this one, marked as a part of the same run."""
-        object.__setattr__(part, "_whole", self._whole or self)
+        vars(part)["_beginnings"] = self._beginnings
         return part
+
+    @cached_property
+    def _beginnings(self) -> dict[int, tuple[int, str]]:
+        """Digests of the first samples of the run, by which its parts are known without their samples.
+
+        Number of samples, a power of two -> how many of them differ from the sample before, and the digest.
+        """
+        if self.continues is not None:
+            return self.continues._beginnings
+        samples = np.column_stack([self.u, self.y]).astype(float) + 0.0  # one zero, without a sign
+        moving = np.any(samples[1:] != samples[:-1], axis=1)
+        digest, found, done = hashlib.sha256(repr((self.Ts, samples.shape[1])).encode()), {}, 0
+        for n in (2**k for k in range(1, self.N.bit_length())):
+            digest.update(samples[done:n].tobytes())
+            found[n], done = (int(moving[: n - 1].sum()), digest.hexdigest()), n
+        return found
 
     def split(
         self, share: float | None = None, *, seconds: float | None = None
@@ -461,17 +475,14 @@ def _one_after_the_other(a: Recording, b: Recording) -> bool:
 def of_one_run(a: Recording, b: Recording) -> bool:
     """Whether two recordings are parts of one run, or the same one.
 
-    The recordings from which they were made by `slice` and `decimate` are compared, from their beginning
-    (`continues`). Two different runs may begin with the same standstill, so the common beginning must have
-    `FEWEST_MOVING` samples that differ from the sample before.
+    Parts that `slice` and `decimate` have made know the beginning of their run, and so does a recording that
+    continues another one. Two different runs may begin with the same standstill, so the common beginning must
+    have `FEWEST_MOVING` samples that differ from the sample before.
     """
-    first, second = (_beginning(r) for r in (a, b))
-    N = min(first.N, second.N)
-    if first.Ts != second.Ts or first.y.shape[1] != second.y.shape[1]:
+    common = max(a._beginnings.keys() & b._beginnings.keys(), default=None)
+    if common is None or a._beginnings[common] != b._beginnings[common]:
         return False
-    here, there = (np.column_stack([r.u[:N], r.y[:N]]) for r in (first, second))
-    moving = np.count_nonzero(np.any(here[1:] != here[:-1], axis=1))
-    return bool(moving >= FEWEST_MOVING) and np.array_equal(here, there)
+    return a._beginnings[common][0] >= FEWEST_MOVING
 
 
 # Attributes that two parts of one run of one machine have in common.
@@ -512,14 +523,6 @@ def _goes_on(a: Recording, b: Recording) -> bool:
     n = min(a.N, before.N)  # `a` may be joined already, and longer than the part that `b` continues
     ends = math.isclose(a.start + a.N * a.Ts, b.start, abs_tol=0.5 * a.Ts)
     return ends and np.array_equal(before.u[-n:], a.u[-n:]) and np.array_equal(before.y[-n:], a.y[-n:])
-
-
-def _beginning(recording: Recording) -> Recording:
-    """The first recording of a run."""
-    recording = recording._whole or recording
-    while recording.continues is not None:
-        recording = recording.continues
-    return recording
 
 
 def check_apart(fitted: Sequence[Recording], unseen: Sequence[Recording], purpose: str, reason: str) -> None:
