@@ -371,14 +371,15 @@ def as_options(sentence: str) -> str:
     sentence = re.sub(r"\btime_unit=(?!')", "--time-unit", sentence)
     sentence = re.sub(r"\bresample='?(\w+)'?", r"--resample \1", sentence)
     sentence = re.sub(r"\bcounts=\{'(\w+)': (\d+)\}", r"--counts \1=\2", sentence)
-    sentence = re.sub(r"\b(input|time|Ts|counts)=(?=\d)", r"--\1 ", sentence)
+    # "set Ts=" is about a setting of `rotflex reproduce`.
+    sentence = re.sub(r"(?<!set )\b(input|time|Ts|counts)=(?=\d)", r"--\1 ", sentence)
     sentence = sentence.replace("leave Ts out", "leave --Ts out")
     sentence = re.sub(r"\boutputs=\{'(\w+)': 'COLUMN'\}", r"--output \1=COLUMN", sentence)
     sentence = sentence.replace(
         "the model starting values nearer to the machine",
         "starting values nearer to the machine, such as --joint paper:stiffness=1.2",
     )
-    sentence = re.sub(r"\b(input|time|Ts)=", r"--\1", sentence)
+    sentence = re.sub(r"(?<!set )\b(input|time|Ts)=", r"--\1", sentence)
     sentence = re.sub(r"\boutputs=|Argument `outputs`", "--output", sentence)
     sentence = re.sub(r"\bsignals=|Argument `signals`", "--signal", sentence)
     sentence = re.sub(r"a mapping such as \{'([^']+)': '(\w+)'\}", r'for instance "\1=\2"', sentence)
