@@ -43,8 +43,8 @@ import json
 import math
 import sys
 import time
-from collections.abc import Callable, Iterator
-from concurrent.futures import CancelledError, ProcessPoolExecutor, as_completed
+from collections.abc import Callable, Collection, Iterator
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import get_context
 from pathlib import Path
@@ -168,15 +168,10 @@ def rows(
         broken = list[Job]()
         with ProcessPoolExecutor(workers, context, initializer=prepare, initargs=(started,)) as pool:
             running = {pool.submit(task, job): job for job in left}
-            for done in as_completed(running):
-                if time.monotonic() > until:
-                    for waiting in running:
-                        waiting.cancel()
+            for done in finished(running, until):
                 job = running[done]
                 try:
                     row = done.result()
-                except CancelledError:
-                    continue
                 except BrokenProcessPool:
                     broken.append(job)
                     continue
@@ -188,6 +183,16 @@ def rows(
                 yield job, {**job, "error": "its process died", "lines": []}
             return
         left = broken
+
+
+def finished(running: Collection[Future[Any]], until: float) -> Iterator[Future[Any]]:
+    """Yields jobs as they end; none is started after the time `until` of the monotonic clock."""
+    for done in as_completed(running):
+        if time.monotonic() > until:
+            for waiting in running:
+                waiting.cancel()
+        if not done.cancelled():
+            yield done
 
 
 def save(path: Path, results: dict[str, Any]) -> None:

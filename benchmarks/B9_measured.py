@@ -35,7 +35,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -44,7 +44,7 @@ if str(HERE) not in sys.path:
     sys.path.insert(0, str(HERE))
 
 import rotflex_jax as rf
-from B0_discovery import save
+from B0_discovery import finished, save
 from measured_machines.page import page
 from origin import begin
 from rotflex_jax.arena.measured import MACHINES
@@ -97,12 +97,8 @@ def side_by_side(
 
     with tempfile.TemporaryDirectory() as cache, ThreadPoolExecutor(workers) as pool:
         running = {pool.submit(one, *way, cache): way for way in todo}
-        for done in as_completed(running):
-            if time.monotonic() > until:
-                for waiting in running:
-                    waiting.cancel()
-            if not done.cancelled():
-                yield *running[done], done.result()
+        for done in finished(running, until):
+            yield *running[done], done.result()
 
 
 def measured(machine: str, direction: str, methods: list[str], warm: bool) -> dict[str, Any]:

@@ -70,7 +70,7 @@ def search_each(
     if len(result.failed) == len(files):
         raise InputError(
             f"No search of {len(files)} gave an answer; the first, {result.rows[0].name}: "
-            f"{given.as_options(result.rows[0].reason)}"
+            f"{result.rows[0].reason}"
         )
     text = json.dumps(result.to_dict(), indent=2)
     if json_file == given.STDOUT:

@@ -354,8 +354,8 @@ def load(
             )
     if arm_absolute:
         y = deflection(y, table.label, accepted)
-    unsaid = {c: name for c, name in chosen.items() if c in turned and c not in per_turn}
-    unsaid = {c: name for c, name in unsaid.items() if not degrees and c not in (units or {})}
+    said = set(chosen) if degrees else {*per_turn, *(units or {})}
+    unsaid = {c: name for c, name in chosen.items() if c in turned - said}
     read = stamps and time_unit is None and "units" not in accepted
     remarks = unused_sensors(table, tuple(y), {clock, *names})
     remarks += conversions_by_name(table, unsaid, clock if read else "")

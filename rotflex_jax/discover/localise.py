@@ -533,8 +533,7 @@ def locate_in_windows(
         what = (
             f"Free runs over {window_seconds:g} s diverge, so that their error does not show what is missing."
         )
-        none = np.zeros(0)
-        return (Where(what, 1.0, 1.0, "time", ", ".join(channels), none, none, none, "s"),)
+        return (_nowhere(what, channels),)
     return locate(recording, residual, channels, noise, model.mechanism, window_seconds=window_seconds)
 
 
@@ -571,15 +570,14 @@ def _nothing_stands_out(e: np.ndarray, channels: Sequence[str], noise: Mapping[s
     """The statement that nothing stands out."""
     rms = dict(zip(channels, np.sqrt(np.mean(e**2, axis=0)).tolist(), strict=True))
     small = all(rms[c] <= 1.3 * noise.get(c, 0.0) for c in channels)
-    return Where(
+    return _nowhere(
         "The error is spread evenly: no time, frequency, speed or deflection stands out"
         + (", and it is no larger than the noise of the sensors." if small else "."),
-        1.0,
-        1.0,
-        "time",
-        ", ".join(channels),
-        np.zeros(0),
-        np.zeros(0),
-        np.zeros(0),
-        "s",
+        channels,
     )
+
+
+def _nowhere(statement: str, channels: Sequence[str]) -> Where:
+    """A statement that is about no part of a recording, and so has no profile."""
+    none = np.zeros(0)
+    return Where(statement, 1.0, 1.0, "time", ", ".join(channels), none, none, none, "s")

@@ -19,12 +19,11 @@ from rotflex_jax.discover.supermodel import EffectLocation
 from rotflex_jax.discover.validation import Horizons, SearchHorizon, ValidatedHypothesis
 from rotflex_jax.effects.labels import effect_label
 from rotflex_jax.errors import InputError
+from rotflex_jax.mechanism.roles import BIAS, OFFSET
 from rotflex_jax.text.numbers import percent_probable
 
 # Number of draws of the weights of half seconds, and the seed that makes them reproducible.
 DRAWS, SEED = 2000, 0
-# Effects that a search counts as calibrations of a recording.
-OFFSETS = ("voltage_offset", "sensor_bias")
 # Least probability of a set that a sentence names.
 LEAST_NAMED = 0.01
 
@@ -196,7 +195,7 @@ def set_labels(effects: frozenset[str]) -> tuple[str, ...]:
     An offset or bias that belongs to the machine is in every set, so a set of these alone adds no effect.
     """
     labels = tuple(effect_label(*parts(n)) for n in sorted(effects))
-    if labels and all(parts(n)[0] in OFFSETS for n in effects):
+    if labels and all(parts(n)[0] in (OFFSET, BIAS) for n in effects):
         return (f"nothing beside {' and '.join(labels)}",)
     return labels or ("nothing more",)
 

@@ -94,6 +94,10 @@ def _places(mechanism: Mechanism, cls: type[Effect]) -> list[str]:
     return [place for place in named + others if fits(place)]
 
 
+OFFSET, BIAS = "voltage_offset", "sensor_bias"
+"""Names of the effects that are calibrations."""
+
+
 def calibrations(mechanism: Mechanism) -> list[tuple[str, str]]:
     """Calibrations (effect, location) that each recording has, independent of the physics.
 
@@ -106,4 +110,4 @@ def calibrations(mechanism: Mechanism) -> list[tuple[str, str]]:
         for name, quantity in zip(mechanism.channels, mechanism.quantities, strict=True)
         if sensor_role(mechanism, name) == "alpha" and not (alone and not quantity.is_position)
     ]
-    return [("voltage_offset", "input"), *(("sensor_bias", name) for name in biased)]
+    return [(OFFSET, "input"), *((BIAS, name) for name in biased)]

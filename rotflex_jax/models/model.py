@@ -162,12 +162,13 @@ class Model:
                 f"has the channels {', '.join(recording.channels)}; name the column of {missing[0]}, "
                 f"outputs={{{missing[0]!r}: 'COLUMN'}}, or give a model with the outputs of the recording."
             )
-        for channel, unit in output_units(self.mechanism).items():
-            if in_radians(recording.unit(channel)) and unit.startswith("rad"):
+        for channel in self.mechanism.channels:
+            given = recording.unit(channel)
+            if in_radians(given) and (unit := output_units(self.mechanism)[channel]).startswith("rad"):
                 raise InputError(
-                    f"Channel {channel!r} of the recording is in {recording.unit(channel)}, but the output "
-                    f"{channel} of the model is in {unit}; convert it (numpy.deg2rad), or load the file with "
-                    f"units={{{channel!r}: {recording.unit(channel)!r}}}, which converts it."
+                    f"Channel {channel!r} of the recording is in {given}, but the output {channel} of the "
+                    f"model is in {unit}; convert it (numpy.deg2rad), or load the file with "
+                    f"units={{{channel!r}: {given!r}}}, which converts it."
                 )
         return np.stack([recording.channel(c) for c in self.mechanism.channels], axis=1)
 
