@@ -1,13 +1,19 @@
 """Checks of arguments of the public functions; an invalid argument is refused with one sentence."""
 
+import difflib
+import functools
+import inspect
 import math
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any
+from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 from jaxtyping import Float, Num
 
 from rotflex_jax.errors import InputError
+
+Given = ParamSpec("Given")
+Made = TypeVar("Made")
 
 
 def shown(value: Any) -> str:
@@ -151,6 +157,82 @@ def one_of(value: Any, name: str, choices: Iterable[str]) -> str:
     raise InputError(
         f"Argument `{name}` must be one of {', '.join(map(repr, listed))}, but is {shown(value)}; "
         "give one of these."
+    )
+
+
+def closest(name: str, choices: Iterable[str]) -> str:
+    """The choice that is spelled most like a name; empty if none is like it."""
+    return next(iter(difflib.get_close_matches(name, list(choices), n=1)), "")
+
+
+def choose(name: str, choices: Iterable[str], what: str) -> str:
+    """`name` if it is one of the choices; otherwise an `InputError` that suggests the closest choice."""
+    listed = list(choices)
+    if name in listed:
+        return name
+    close = closest(name, listed)
+    hint = f"did you mean {close}?" if close else f"choose from {', '.join(listed)}."
+    raise InputError(f"There is no {what} called {name!r}; {hint}")
+
+
+def known_arguments(function: Callable[Given, Made]) -> Callable[Given, Made]:
+    """The same function, which refuses arguments that it does not have, or lacks, with one sentence.
+
+    Its signature stays as it is. For functions and classes with many arguments by name.
+
+    >>> @known_arguments
+    ... def joint(*, stiffness: float = 1.0, damping: float = 0.0) -> None: ...
+    >>> joint(stifness=2)
+    Traceback (most recent call last):
+        ...
+    rotflex_jax.errors.InputError: joint was given stifness=2, but accepts stiffness, damping; \
+did you mean stiffness?
+    """
+
+    @functools.wraps(function)
+    def checked(*values: Given.args, **named: Given.kwargs) -> Made:
+        try:
+            return function(*values, **named)
+        except TypeError:
+            _check_arguments(function, values, named)
+            raise  # the arguments fit, and the error comes from within
+
+    return checked
+
+
+def _check_arguments(function: Callable[..., Any], values: tuple[Any, ...], named: dict[str, Any]) -> None:
+    """Refuse arguments that do not fit the signature of a function, or of a class given by its `__init__`."""
+    signature = inspect.signature(function)
+    try:
+        signature.bind(*values, **named)
+        return
+    except TypeError:
+        pass
+    what = function.__qualname__.removesuffix(".__init__").rpartition(".")[2]
+    every = {n: p for n, p in signature.parameters.items() if n != "self"}
+    values = values[len(signature.parameters) - len(every) :]
+    accepted = ", ".join(every)
+    if unknown := [n for n in named if n not in every]:
+        close = closest(unknown[0], every)
+        given, hint = f"{unknown[0]}={shown(named[unknown[0]])}", f"did you mean {close}?" if close else ""
+        raise InputError(
+            f"{what} was given {given}, but accepts {accepted or 'no argument'}; {hint or 'leave it out.'}"
+        )
+    placed = [n for n, p in every.items() if p.kind is not p.KEYWORD_ONLY]
+    if len(values) > len(placed):
+        raise InputError(
+            f"{what} was given {shown(values[len(placed)])} without a name, but accepts {accepted}; write "
+            "NAME=VALUE with one of these."
+        )
+    if twice := [n for n in placed[: len(values)] if n in named]:
+        raise InputError(
+            f"{what} was given {twice[0]} twice, by its place and by its name, but needs it once; leave "
+            "one of them out."
+        )
+    needed = [n for n, p in every.items() if p.default is p.empty]
+    missing = [n for n in needed if n not in (*named, *placed[: len(values)])]
+    raise InputError(
+        f"{what} was given no {missing[0]}, but needs {', '.join(needed)}; add {missing[0]}=VALUE."
     )
 
 

@@ -2,6 +2,7 @@
 
 import ast
 import dataclasses
+import inspect
 import json
 import math
 from pathlib import Path
@@ -438,6 +439,17 @@ def test_bad_parameters_are_named(cls):
                 cls(at=cls.ports[0], **{name: value})
     with pytest.raises(InputError, match="name of a port"):
         cls(at=0.3)
+
+
+@pytest.mark.parametrize("cls", CATALOG.values(), ids=CATALOG)
+def test_a_misspelt_parameter_is_refused(cls):
+    accepted = list(inspect.signature(cls).parameters)
+    assert {"at", *cls.declared()} <= set(accepted)
+    last = accepted[-1]
+    with pytest.raises(InputError) as refused:
+        cls(**{"at": cls.ports[0], f"{last}s": 0.1})
+    said = f"{cls.__name__} was given {last}s=0.1, but accepts {', '.join(accepted)}; did you mean {last}?"
+    assert str(refused.value) == said
 
 
 def test_what_may_be_negative():

@@ -1,5 +1,8 @@
 """The presets against the values of their sources."""
 
+import inspect
+import re
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,6 +10,7 @@ import pytest
 
 from rotflex_jax import Recording, fit, joints
 from rotflex_jax.arena.simulator.records import COUNT, JITTER, make_record
+from rotflex_jax.checks import known_arguments
 from rotflex_jax.effects import Coulomb, Motor
 from rotflex_jax.errors import InputError
 from rotflex_jax.joints.rotary_flexible import ARM_ANCHORS, HUB_ANCHORS, SIDE, SPRINGS
@@ -229,3 +233,35 @@ def test_friction_at_the_hub_tells_the_torque_constant_to_the_deflection() -> No
     assert found[constant].value == pytest.approx(true, abs=4 * found[constant].std)
     assert found["hub.coulomb.level"].value == pytest.approx(0.03, rel=0.02)
     assert fit(joint.trust(constant), angle).noise["alpha"] > 3 * found.noise["alpha"]
+
+
+@pytest.mark.parametrize("name", [n for n in joints.__all__ if inspect.isfunction(getattr(joints, n))])
+def test_a_misspelt_argument_of_a_preset_is_refused(name: str) -> None:
+    preset = getattr(joints, name)
+    accepted = list(inspect.signature(preset).parameters)
+    wrong = f"{accepted[0]}s" if accepted else "stiffness"
+    with pytest.raises(InputError) as refused:
+        preset(**{wrong: 2})
+    hint = f"did you mean {accepted[0]}?" if accepted else "leave it out."
+    listed = ", ".join(accepted) or "no argument"
+    assert str(refused.value) == f"{name} was given {wrong}=2, but accepts {listed}; {hint}"
+
+
+@pytest.mark.parametrize(
+    ("call", "said"),
+    [
+        (lambda: joints.paper(2.0), "paper was given 2.0 without a name, but accepts hub_inertia, "),
+        (lambda: joints.paper(colour="red"), "paper was given colour='red', but accepts hub_inertia, "),
+        (lambda: joints.flexible_joint(hub_inertia=1e-3), "flexible_joint was given no arm_inertia"),
+        (lambda: joints.quanser_2002(1, arm=2), "quanser_2002 was given arm twice"),
+    ],
+)
+def test_arguments_that_do_not_fit_a_preset_are_refused(call, said) -> None:
+    with pytest.raises(InputError, match=f"^{re.escape(said)}"):
+        call()
+
+
+def test_a_type_error_within_a_function_is_no_wrong_argument() -> None:
+    with pytest.raises(TypeError) as failed:
+        known_arguments(lambda: len(3))()  # type: ignore[arg-type]
+    assert not isinstance(failed.value, InputError)

@@ -4,6 +4,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
+from rotflex_jax.checks import choose
 from rotflex_jax.cli import arguments as given, terminal
 from rotflex_jax.cli.recordings import Columns, joint_for, reads_files
 from rotflex_jax.errors import InputError
@@ -47,7 +48,7 @@ def data_fetch(
     from rotflex_jax.data.registry import BY_HAND
 
     for name in names:
-        by_name.choose(name, (*DATASETS, *BY_HAND), "data set")
+        choose(name, (*DATASETS, *BY_HAND), "data set")
     for name in names:
         with terminal.progress(f"Fetching {name}"):
             paths = fetch(name)

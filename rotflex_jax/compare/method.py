@@ -2,7 +2,6 @@
 
 import abc
 import dataclasses
-import difflib
 import itertools
 import time
 from collections.abc import Callable, Iterable, Sequence
@@ -12,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from rotflex_jax import metrics
-from rotflex_jax.checks import shown
+from rotflex_jax.checks import choose, shown
 from rotflex_jax.errors import InputError
 from rotflex_jax.models.model import Model
 from rotflex_jax.recording import Recording
@@ -118,7 +117,7 @@ def selected_methods(methods: Iterable[str | Method] | None) -> tuple[Method, ..
     listed = [methods] if isinstance(methods, (str, Method)) else list(methods)
     found: dict[str, Method] = {}
     for item in listed:
-        method = _method_by_name(item) if isinstance(item, str) else item
+        method = METHODS[choose(item.strip(), METHODS, "method")] if isinstance(item, str) else item
         _check(method)
         if found.get(method.name, method) != method:
             raise InputError(
@@ -129,15 +128,6 @@ def selected_methods(methods: Iterable[str | Method] | None) -> tuple[Method, ..
     if not found:
         raise InputError(f"No method was given; choose from {', '.join(METHODS)}.")
     return tuple(found.values())
-
-
-def _method_by_name(name: str) -> Method:
-    name = name.strip()
-    if name in METHODS:
-        return METHODS[name]
-    close = difflib.get_close_matches(name, METHODS, n=1)
-    hint = f"did you mean {close[0]}?" if close else f"choose from {', '.join(METHODS)}."
-    raise InputError(f"There is no method called {name!r}; {hint}")
 
 
 def _check(method: Any) -> None:

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Real
 
-from rotflex_jax.checks import shown
+from rotflex_jax.checks import known_arguments, shown
 from rotflex_jax.errors import InputError
 from rotflex_jax.parameters import Specification, specifications
 from rotflex_jax.recording.samples import name_and_unit
@@ -666,7 +666,7 @@ def register(effect: EffectClass) -> EffectClass:
         effect: A frozen dataclass that derives from one of the kinds.
 
     Returns:
-        The class, unchanged.
+        The class, whose constructor refuses arguments that it does not have with one sentence.
 
     Raises:
         InputError: If another class already has the name.
@@ -679,4 +679,5 @@ def register(effect: EffectClass) -> EffectClass:
             f"name of its own, so give {effect.__qualname__} another one."
         )
     CATALOG[effect.name] = effect
+    effect.__init__ = known_arguments(effect.__init__)
     return effect

@@ -1,6 +1,5 @@
 """From texts of the command line to a joint, a model of the user, or an effect with its parameters."""
 
-import difflib
 import importlib
 import importlib.util
 import inspect
@@ -10,6 +9,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from rotflex_jax.checks import choose
 from rotflex_jax.errors import InputError
 
 JOINTS = (
@@ -23,16 +23,6 @@ JOINTS = (
     "sts3215",
     "xl330_pendulum",
 )
-
-
-def choose(name: str, choices: Iterable[str], what: str) -> str:
-    """`name` if it is one of the choices; otherwise an `InputError` that suggests the closest choice."""
-    choices = list(choices)
-    if name in choices:
-        return name
-    close = difflib.get_close_matches(name, choices, n=1)
-    hint = f"did you mean {close[0]}?" if close else f"choose from {', '.join(choices)}."
-    raise InputError(f"There is no {what} called {name!r}; {hint}")
 
 
 def joint(text: str) -> Any:

@@ -8,6 +8,7 @@ curvature of the beam at the clamp is `4 / L` times the sum of these angles, wha
 
 import math
 
+from rotflex_jax.checks import known_arguments
 from rotflex_jax.effects import Inertia, Motor, SensorGain, Spring, Viscous
 from rotflex_jax.joints.rotary_flexible import hub_inertia, srv02_motor
 from rotflex_jax.mechanism import Mechanism
@@ -30,6 +31,7 @@ PORTS = {
 }
 
 
+@known_arguments
 def flexible_link(
     *,
     mass: float = 0.065,

@@ -8,6 +8,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from rotflex_jax import checks
+from rotflex_jax.checks import known_arguments
 from rotflex_jax.effects import (
     Coulomb,
     CurrentDrive,
@@ -32,6 +33,7 @@ IGNORABLE = ("forcerange", "ctrlrange", "ref", "springref", "tendon", "equality"
 """Entries of a file that can be left out on request."""
 
 
+@known_arguments
 def load_mjcf(
     path: str | os.PathLike[str],
     joint: str | None = None,

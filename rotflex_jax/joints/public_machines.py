@@ -4,6 +4,7 @@ import dataclasses
 import math
 from types import MappingProxyType
 
+from rotflex_jax.checks import known_arguments
 from rotflex_jax.effects import CurrentDrive, Inertia, MeasuredDisturbance, Motor, Spring, Viscous
 from rotflex_jax.effects.base import Effect, driven_place
 from rotflex_jax.errors import InputError
@@ -12,6 +13,7 @@ from rotflex_jax.mechanism import Mechanism
 from rotflex_jax.mechanism.quantity import Units
 
 
+@known_arguments
 def single_inertia(
     inertia: float = 0.0021,
     *,
@@ -63,6 +65,7 @@ FORCE_PER_VOLT = 35.15065188248547
 """Force on the carriage per volt of command [N/V], as given with the recordings."""
 
 
+@known_arguments
 def emps(mass: float = 80.0, *, damping: float = 100.0, gain: float = FORCE_PER_VOLT) -> Mechanism:
     """A linear axis with a mass, viscous damping, a force proportional to the voltage, and one output.
 
@@ -100,6 +103,7 @@ def emps(mass: float = 80.0, *, damping: float = 100.0, gain: float = FORCE_PER_
     )
 
 
+@known_arguments
 def silverbox(frequency: float = 60.0, *, damping_ratio: float = 0.1, stiffness: float = 1.0) -> Mechanism:
     """A mass on a spring with a damper, from voltage to voltage.
 
@@ -144,6 +148,7 @@ GEAR_RATIO, TORQUE_CONSTANT, RESISTANCE = 48.4, 0.0107, 3.29
 """Turns of the motor per turn of the arm, torque per current [N m/A] and armature resistance [ohm]."""
 
 
+@known_arguments
 def rotary_arm(flexible: bool = False, *, arm_inertia: float = 0.004, stiffness: float = 1.0) -> Mechanism:
     """The rotary arm of a student laboratory with its constants; all parameters of the motor are trusted.
 
@@ -207,6 +212,7 @@ TWO_DOF_LINK = MappingProxyType(
 """Constants of the laboratory by stage: J11, J12, Ks1, Ktg1, B11, B12 and those of stage 2, in SI units."""
 
 
+@known_arguments
 def two_dof_link(stage: int = 1) -> Mechanism:
     """One stage of the serial flexible link alone: a flexible joint driven by a current.
 
@@ -257,6 +263,7 @@ SECOND_CURRENT = "current of motor 2 [A]"
 """Signal that drives the second stage of `two_stage_link`."""
 
 
+@known_arguments
 def two_stage_link() -> Mechanism:
     """Both stages of the serial flexible link in one mechanism: two currents, four coordinates, four outputs.
 

@@ -16,7 +16,7 @@ import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from rotflex_jax.checks import names, shown
+from rotflex_jax.checks import known_arguments, names, shown
 from rotflex_jax.effects import Inertia, Motor, Spring, Viscous
 from rotflex_jax.errors import InputError
 from rotflex_jax.mechanism import Mechanism
@@ -53,6 +53,7 @@ HUB_ANCHORS: dict[str, float] = {"A": 1.25 * INCH, "B": 1.00 * INCH, "C": 0.75 *
 ARM_ANCHORS: dict[int, float] = {1: 4.0 * INCH, 2: 3.5 * INCH, 3: 3.0 * INCH}
 
 
+@known_arguments
 def spring_stiffness(
     spring: int = 2, hub_anchor: str = "B", arm_anchor: int = 2, *, preload_only: bool = False
 ) -> float:
@@ -98,6 +99,7 @@ def spring_stiffness(
     return 2 * (kit.rate * (R * r) ** 2 / D + force * (R * d / D**0.5 - (R * r) ** 2 / D**1.5))
 
 
+@known_arguments
 def spring_settings() -> dict[tuple[int, str, int], float]:
     """Stiffness [N m/rad] of all 27 settings (spring, hub anchor, arm anchor)."""
     return {
@@ -120,6 +122,7 @@ _EFFICIENCY = 0.69 * 0.90
 _GEAR_RATIO = 70.0
 
 
+@known_arguments
 def flexible_joint(
     *,
     hub_inertia: float,
@@ -195,6 +198,7 @@ def _measured(sensors: str | Sequence[str]) -> tuple[str, ...]:
     return given
 
 
+@known_arguments
 def paper(
     *,
     hub_inertia: float = 0.0021,
@@ -264,6 +268,7 @@ def paper(
     )
 
 
+@known_arguments
 def quanser_2002(
     arm: int = 2,
     *,
@@ -296,6 +301,7 @@ def quanser_2002(
     return _srv02(arm, stiffness, hub_damping=0.004, inductance=inductance, tied=tied, sensors=sensors)
 
 
+@known_arguments
 def quanser_2010(
     arm: int = 2,
     *,
@@ -326,6 +332,7 @@ def quanser_2010(
     return _srv02(arm, stiffness, hub_damping=0.015, inductance=inductance, tied=tied, sensors=sensors)
 
 
+@known_arguments
 def arm_inertia(arm: int = 2) -> float:
     """Moment of inertia [kg m^2] of the manufacturer's arm about the axis of the joint.
 
@@ -348,6 +355,7 @@ def arm_inertia(arm: int = 2) -> float:
     return main if centre is None else main + 0.030 * ((6 * INCH) ** 2 / 12 + centre**2)
 
 
+@known_arguments
 def hub_inertia(tachometer: bool = True, body: float = 0.0005) -> float:
     """Moment of inertia [kg m^2] of the manufacturer's servo and the body on it, reflected to the load shaft.
 

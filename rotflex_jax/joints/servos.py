@@ -3,7 +3,7 @@
 import dataclasses
 from typing import Literal, get_args
 
-from rotflex_jax.checks import number, one_of
+from rotflex_jax.checks import known_arguments, number, one_of
 from rotflex_jax.effects import (
     CurrentMeter,
     DutyMeter,
@@ -41,6 +41,7 @@ METERS: dict[str, type[Memory]] = {"current": CurrentMeter, "duty": DutyMeter}
 """Reading of a servo -> the effect that provides it."""
 
 
+@known_arguments
 def position_servo(
     inertia: float = 0.005, *, servo: PositionLoop | None = None, weight: float = 0.0
 ) -> Mechanism:
@@ -76,6 +77,7 @@ def position_servo(
     )
 
 
+@known_arguments
 def xl330_pendulum(
     mass: float = 0.49,
     length: float = 0.1,
@@ -119,6 +121,7 @@ def xl330_pendulum(
     )
 
 
+@known_arguments
 def sts3215(
     inertia: float = 0.03,
     *,
@@ -165,6 +168,7 @@ def sts3215(
     return position_servo(inertia, servo=servo, weight=weight)
 
 
+@known_arguments
 def servo(
     kind: ServoKind = "xl330",
     inertia: float | None = None,
