@@ -2,6 +2,7 @@
 
 import copy
 import json
+import math
 import shutil
 import time
 from pathlib import Path
@@ -14,7 +15,9 @@ from spindle import PAIRS, SPINDLE, spun
 import rotflex_jax as rf
 from rotflex_jax.cli import main, terminal
 from rotflex_jax.cli.rounds import RoundsSoFar
-from rotflex_jax.discover.checkpoint import TimeLeft, beginning, digest_of_search
+from rotflex_jax.discover.checkpoint import AddedEffect, TimeLeft, beginning, digest_of_search
+from rotflex_jax.discover.result import HorizonGain
+from rotflex_jax.discover.supermodel import EffectLocation
 from rotflex_jax.discover.validation import Horizons
 from rotflex_jax.errors import InputError
 from rotflex_jax.recording.recording import content
@@ -179,6 +182,14 @@ class Clock:
 
     def __call__(self) -> float:
         return self.now
+
+
+@pytest.mark.parametrize("score", [12.5, math.nan])
+def test_an_effect_that_was_added_without_a_score_is_kept(score: float) -> None:
+    gain = HorizonGain(1.0, 2.0, 0.5, 3.0)
+    added = AddedEffect(EffectLocation("lugre", "hub"), score, (), (gain, None))
+    again = AddedEffect.from_dict(json.loads(json.dumps(added.to_dict(), allow_nan=False)))
+    assert again.score == pytest.approx(score, nan_ok=True) and again._replace(score=score) == added
 
 
 def test_the_time_left_is_that_of_the_steps_measured() -> None:

@@ -6,7 +6,7 @@ import pytest
 import rotflex_jax as rf
 from rotflex_jax.arena.simulator.records import make_record
 from rotflex_jax.discover.verdict import Verdict
-from rotflex_jax.effects import Coulomb, PeriodicDisturbance, VoltageDrift
+from rotflex_jax.effects import Coulomb, Motor, PeriodicDisturbance, VoltageDrift, VoltageOffset
 
 FS, SECONDS, FREQUENCY, SIZE = 200.0, 10.0, 3.3, 0.15
 CANDIDATES = [(Coulomb, "hub"), (PeriodicDisturbance, "input"), (VoltageDrift, "input")]
@@ -22,7 +22,11 @@ def recording(size: float, seed: int) -> rf.Recording:
 
 @pytest.fixture(scope="module")
 def disturbed():
-    return rf.discover(rf.joints.paper(), *recording(SIZE, 3).split(0.7), candidates=CANDIDATES, rounds=3)
+    said: list[str] = []
+    parts = recording(SIZE, 3).split(0.7)
+    found = rf.discover(rf.joints.paper(), *parts, candidates=CANDIDATES, rounds=3, progress=said.append)
+    assert f"round 1: scoring {len(found.ranking)} candidates" in said and len(found.ranking) == 3
+    return found
 
 
 def test_a_disturbance_is_named_with_its_frequency_and_size_beside_friction(disturbed) -> None:
@@ -82,7 +86,14 @@ def test_any_of_several_recordings_may_have_it() -> None:
 
 
 def test_without_a_line_it_is_no_candidate() -> None:
-    found = rf.discover(rf.joints.paper(), *recording(0.0, 4).split(0.7), candidates=CANDIDATES, rounds=1)
+    said: list[str] = []
+    given = [*CANDIDATES, (VoltageOffset, "input"), (Motor, "hub")]
+    parts = recording(0.0, 4).split(0.7)
+    found = rf.discover(rf.joints.paper(), *parts, candidates=given, rounds=1, progress=said.append)
     assert [r.effect for r in found.rounds] == ["coulomb"]
     assert "periodic_disturbance" not in {x.effect for x in found.ranking}
     assert "voltage_drift" in {x.effect for x in found.ranking}
+    without = "without periodic_disturbance at input, as the errors have no line that the input lacks"
+    assert f"round 1: scoring {len(found.ranking)} candidates; {without}" in said
+    (note,) = [n for n in found.notes if n.startswith("Not among the candidates")]
+    assert note.endswith(": voltage offset, direct-current motor at the hub."), note

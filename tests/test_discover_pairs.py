@@ -346,6 +346,15 @@ def test_a_pair_of_the_best_effects_is_tried_once(s, monkeypatch: pytest.MonkeyP
     assert find_pair(*given) == (None, []) and not asked
 
 
+def test_a_pair_with_implausible_parameters_is_said_to_be_left_out(s):
+    starts = tuple(CandidateStart(p, np.zeros(1)) for p in (STRIBECK, SPRING))
+    lines: list[str] = []
+    pairs._say_gains({}, baseline_of(s), [(PairStart(starts), PairStart(starts))], lines.append)
+    assert lines == [
+        "  left out: stribeck at hub with cubic_spring at joint, since its parameters are not plausible"
+    ]
+
+
 @pytest.fixture(scope="module")
 def small():
     """Recordings with little friction: likelihood, fitted baseline, and its score test."""

@@ -3,6 +3,8 @@
 import dataclasses
 import math
 from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,6 +14,9 @@ import rotflex_jax as rf
 import rotflex_jax.effects as fx
 from rotflex_jax.arena.simulator.records import make_record
 from rotflex_jax.discover import Discovery, forward_selection, search_state
+from rotflex_jax.discover.checkpoint import AddedEffect
+from rotflex_jax.discover.hypothesis import CandidateStart
+from rotflex_jax.discover.supermodel import EffectLocation
 from rotflex_jax.discover.verdict import NEAR_FLOOR, TORQUE_NATS, Assessment, in_noise
 from rotflex_jax.errors import InputError
 from rotflex_jax.recording.recording import check_apart, shared_samples
@@ -116,6 +121,39 @@ def test_the_error_of_a_coarse_integration_is_no_missing_physics(torque_constant
     assert [(r.effect, r.port) for r in found.rounds] == [("coulomb", "hub")]
     assert found.verdict == "found", found.sentence
     assert abs(found.assessment.torque_nats) < TORQUE_NATS / 3
+
+
+def test_a_candidate_with_implausible_parameters_is_said_to_be_left_out(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    refused = {"coulomb": "it is too large"}
+    monkeypatch.setattr(search_state.SearchState, "fault", lambda _, h, p: refused.get(p.effect, ""))
+    said: list[str] = []
+    found = rf.discover(SPINDLE, *spun().split(0.7), candidates=PAIRS, progress=said.append)
+    assert "  left out: coulomb at shaft, since it is too large" in said
+    assert "coulomb" not in {r.effect for r in found.rounds}
+
+
+def test_a_law_that_was_refitted_without_a_score_has_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    law = CandidateStart(EffectLocation("lugre", "hub"), np.zeros(1))
+    winner: Any = SimpleNamespace(location=law.location)
+    for name, value in {
+        "refit_and_validate": [winner],
+        "likelier_of_each": [winner],
+        "choose": (winner, []),
+        "_refit_replaced": [],
+        "describe": "",
+        "horizon_gains": (None, None),
+    }.items():
+        monkeypatch.setattr(forward_selection, name, lambda *_, value=value: value)
+    added: list[AddedEffect] = []
+    problem = SimpleNamespace(measured_values=1.0, noise=np.ones(1))
+    state: Any = SimpleNamespace(
+        problem=problem, current=None, still={}, say=str, add=lambda _, more: added.extend(more)
+    )
+    promising: Any = forward_selection.Promising(winner, [], [law], [law])
+    assert forward_selection.add_best(state, [promising])
+    assert [(a.location, math.isnan(a.score)) for a in added] == [(law.location, True)]
 
 
 def test_a_calibration_has_its_gain_at_either_horizon(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -246,6 +246,11 @@ def test_a_search_leaves_out_candidates_of_sizes_that_no_signal_reaches():
     state = SearchState(Model(sp.baseline()), Horizons, print, present)
     h = sp.start(at, locations=(*s.calibrations, location))
     assert is_physical(s, h, location) and state.is_plausible(h, location)
+    damper = EffectLocation("viscous", "hub")
+    values = h.mean_values(s)
+    values[s.parameter_indices(damper)] = -1.0
+    driving = dataclasses.replace(h, z=Transform.of(s.mechanism.parameter_specifications).unconstrain(values))
+    assert state.fault(driving, damper) == "a parameter is outside its physical range"
     reach = state.reach
     assert reach.input == max(np.abs(r.u).max() for r in found)
     offset = next(c for c in s.calibrations if c.effect == "voltage_offset")
@@ -275,7 +280,7 @@ def test_a_search_leaves_out_candidates_that_need_a_large_offset(present: float,
     state = SearchState(Model(sp.baseline()), Horizons, print, given)
     for sign in (-1, 1):
         assert state.is_plausible(with_offset(sign * 0.98 * most, location), location)
-        assert not state.is_plausible(with_offset(sign * 1.02 * most, location), location)
+        assert "offset" in state.fault(with_offset(sign * 1.02 * most, location), location)
 
 
 @pytest.mark.parametrize(("share", "plausible"), [(0.98, False), (1.02, True)])
@@ -312,7 +317,8 @@ def test_a_search_leaves_out_sensors_that_could_not_read_what_was_recorded(
 
     present: Any = SimpleNamespace(hypothesis=h, free_run=None)
     state = SearchState(Model(sp.baseline()), Horizons, print, present)
-    assert state.is_plausible(with_error(cubic), location) == plausible
+    reason = "" if plausible else "such a sensor could not read what was recorded"
+    assert state.fault(with_error(cubic), location) == reason
     assert is_physical(s, with_error(cubic), location)
     assert state.is_plausible(with_error(10 * abs(cubic)), location)
 

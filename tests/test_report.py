@@ -4,6 +4,7 @@ import base64
 import dataclasses
 import html.parser
 import json
+import math
 import re
 import shutil
 import subprocess
@@ -356,6 +357,15 @@ def test_every_verdict_has_a_headline_and_a_next_step(discovery, verdict, undraw
     text = read(render(other)).text
     assert verdict.shown.headline in text
     assert next_steps(other)[0][:30] in text
+
+
+def test_an_effect_without_a_score_has_none_in_the_report(discovery, undrawn) -> None:
+    said = "Log-likelihood of validation data + 5 120 nat, score 18 432 nat."
+    assert said in read(render(discovery)).text
+    first = dataclasses.replace(discovery.rounds[0], score=math.nan)
+    unscored = dataclasses.replace(discovery, rounds=(first, *discovery.rounds[1:]))
+    assert said.replace(", score 18 432 nat", "") in read(render(unscored)).text
+    assert unscored.to_dict()["rounds"][0]["evidence"]["score"] is None
 
 
 def test_a_report_without_rounds_says_so(undrawn) -> None:

@@ -125,7 +125,7 @@ def trial(job: dict[str, Any], tell: Callable[[str], None] = lambda _: None) -> 
                     "port": r.port,
                     "equivalent": [list(p) for p in r.equivalent],
                     "nats": r.held_out_gain_nats,
-                    "score": r.score,
+                    "score": json_number(r.score),
                 }
                 for r in result.rounds
             ],

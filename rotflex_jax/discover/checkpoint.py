@@ -22,7 +22,7 @@ from rotflex_jax.models.model import Model
 from rotflex_jax.recording import Recording
 from rotflex_jax.recording.recording import content, digest_of
 from rotflex_jax.text.files import path_of
-from rotflex_jax.text.numbers import as_read
+from rotflex_jax.text.numbers import as_read, json_number
 
 
 class Milestone(str):
@@ -63,14 +63,14 @@ def milestone(
         floor: Noise of the sensor, by channel.
 
     >>> line = milestone("+ coulomb at hub", ["theta"], {"theta": "rad"}, np.array([0.01]), np.array([5e-4]))
-    >>> line, line.errors
-    ('+ Coulomb friction at hub: short runs from fitted first states leave theta 0.573 deg', {'theta': 0.01})
+    >>> line
+    '+ Coulomb friction at hub: error of short free runs, first states fitted: theta 0.573 deg'
     """
     read = {c: as_read(1.0, units[c]) for c in channels}
     by_name = dict(zip(channels, (float(e) for e in errors), strict=True))
     label = with_titles(label)
     listed = ", ".join(f"{c} {read[c][0] * e:.3g} {read[c][1]}" for c, e in by_name.items())
-    line = Milestone(f"{label}: short runs from fitted first states leave {listed}")
+    line = Milestone(f"{label}: error of short free runs, first states fitted: {listed}")
     line.label, line.errors, line.kept = label, by_name, {}
     line.floor = dict(zip(channels, (float(f) for f in floor), strict=True))
     line.units = {c: unit for c, (_, unit) in read.items()}
@@ -270,7 +270,7 @@ class AddedEffect(NamedTuple):
 
     Attributes:
         location: Effect and port.
-        score: Penalised score for which it was refitted [nat].
+        score: Penalised score for which it was refitted [nat]; NaN if it was refitted without one.
         rivals: Effects that were not distinguished from it.
         gains: Its gains in predictions and in free runs.
     """
@@ -284,7 +284,7 @@ class AddedEffect(NamedTuple):
         """Plain JSON types."""
         return {
             "effect": list(self.location),
-            "score": self.score,
+            "score": json_number(self.score),
             "rivals": [list(p) for p in self.rivals],
             "gains": [None if g is None else list(g) for g in self.gains],
         }
@@ -297,7 +297,8 @@ class AddedEffect(NamedTuple):
             raise ValueError(written)
         rivals = tuple(EffectLocation(*map(str, p)) for p in written["rivals"])
         location = EffectLocation(*map(str, written["effect"]))
-        return cls(location, float(written["score"]), rivals, (prediction, free_run))
+        score = math.nan if written["score"] is None else float(written["score"])
+        return cls(location, score, rivals, (prediction, free_run))
 
 
 class KeptStage(NamedTuple):

@@ -1,6 +1,7 @@
 """One round of forward selection: score candidates, refit the best, and add one effect or a pair."""
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -12,7 +13,7 @@ from rotflex_jax.discover.friction_of_runs import (
 )
 from rotflex_jax.discover.hypothesis import CandidateStart, generalisations, parameter_count
 from rotflex_jax.discover.pairs import best_candidates, find_pair, is_unexplained
-from rotflex_jax.discover.score_test import Score, promising_at_both
+from rotflex_jax.discover.score_test import Score, candidates_to_score, promising_at_both, residual_lines
 from rotflex_jax.discover.search_state import SearchState
 from rotflex_jax.discover.selection import (
     choose,
@@ -65,8 +66,7 @@ class Promising(NamedTuple):
 
 def score_candidates(state: SearchState) -> list[Promising]:
     """The candidates with the best scores for each model to which they may be added."""
-    left = len(state.problem.supermodel.candidates) - len(state.scores)
-    state.say(beginning("score", f"round {len(state.scores) + 1}: scoring {left} candidates"))
+    state.say(beginning("score", f"round {len(state.scores) + 1}: scoring {_scored(state)}"))
     found = [_promising(state, state.origin)]
     if state.origin is not state.current:
         state.say("the model as it is was fitted far from the values given: candidates beside both")
@@ -74,6 +74,15 @@ def score_candidates(state: SearchState) -> list[Promising]:
     if state.problem.several_runs:  # where friction differs between runs, its slopes with one size are small
         found += _dry_friction(state, found)
     return [p for p in found if p.starts]
+
+
+def _scored(state: SearchState) -> str:
+    """The number of candidates that a round scores, and those that it leaves out, in words."""
+    s, h = state.problem.supermodel, state.origin.hypothesis
+    scored = candidates_to_score(s, h, residual_lines(state.problem, h))
+    left_out = [str(p) for p in s.candidates if p not in (*scored, *h.locations)]
+    without = f"; without {', '.join(left_out)}, as the errors have no line that the input lacks"
+    return f"{len(scored)} candidates" + without * bool(left_out)
 
 
 def _promising(state: SearchState, beside: ValidatedHypothesis) -> Promising:
@@ -169,11 +178,12 @@ def refit_and_validate(
     runs = refit_near_predictions(problem, runs, grown)
     grown, runs = refit_with_own_friction(horizons, Refits(grown, runs), informed)
     state.say("  free runs are fitted, validation follows")
-    plausible = [
-        (h, f, c.location)
-        for h, f, c in zip(grown, runs, starts, strict=True)
-        if state.is_plausible(h, c.location) and state.is_plausible(f, c.location)
-    ]
+    plausible = []
+    for h, f, location in zip(grown, runs, (c.location for c in starts), strict=True):
+        if fault := state.fault(h, location) or state.fault(f, location):
+            state.say(f"  left out: {location}, since {fault}")
+        else:
+            plausible.append((h, f, location))
     found = horizons.all_validated([(h, f) for h, f, _ in plausible], beside)
     validated = [
         dataclasses.replace(v, location=location, parameter_count=parameter_count(s, h, location))
@@ -204,7 +214,7 @@ def add_best(state: SearchState, promising: Sequence[Promising]) -> bool:
         candidates = [*candidates, *(c for _, c in more)]
         winner, rivals = choose(candidates, current, measured, state.problem.noise, bool(state.still))
         assert winner and winner.location
-    nats = max((s.nats for s in scored if s.location == winner.location), default=0.0)
+    nats = max((s.nats for s in scored if s.location == winner.location), default=math.nan)
     not_distinguished = tuple(r.location for r in rivals if r.location)
     added = AddedEffect(winner.location, nats, not_distinguished, horizon_gains(winner, current))
     state.add(winner, [added])
@@ -255,7 +265,7 @@ def add_pair(state: SearchState, rounds: int) -> bool:
     state.add(
         pair.found,
         [
-            AddedEffect(p, nats.get(p, 0.0), tuple(pair.rivals[p]), horizon_gains(pair.found, less))
+            AddedEffect(p, nats.get(p, math.nan), tuple(pair.rivals[p]), horizon_gains(pair.found, less))
             for p, less in pair.members.items()
         ],
     )

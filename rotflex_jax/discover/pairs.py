@@ -258,17 +258,23 @@ def pairs_passed_by(
         # probability: where predictions count little, it would seem as good as the model found.
         elif all(is_plausible(h, p) for p in pair):
             tried[pair] = v
-    _say_gains(tried, found, say)
+    _say_gains(tried, found, others, say)
     fitted_at_both = [v for v in tried.values() if v.free_run]
     return fitted_at_both, [p for p, v in tried.items() if not distinguished(found, v)]
 
 
 def _say_gains(
-    tried: dict[Pair, ValidatedHypothesis], over: ValidatedHypothesis, say: Callable[[str], None]
+    tried: dict[Pair, ValidatedHypothesis],
+    over: ValidatedHypothesis,
+    pairs: Sequence[tuple[PairStart, PairStart]],
+    say: Callable[[str], None],
 ) -> None:
-    """Report a line of progress for each pair, with its gains over a model."""
-    for pair, v in tried.items():
-        say(f"  {_named(pair)}: " + gains_in_words(v, over))
+    """Report a line of progress for each refitted pair: its gains over a model, or that it is left out."""
+    for pair in (start.locations for start, _ in pairs):
+        if (v := tried.get(pair)) is not None:
+            say(f"  {_named(pair)}: " + gains_in_words(v, over))
+        else:
+            say(f"  left out: {_named(pair)}, since its parameters are not plausible")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -319,7 +325,7 @@ def find_pair(
     problem = horizons.prediction.problem
     measured, noise = problem.measured_values, problem.noise
     tried = validated_pairs(horizons, current, pairs, is_plausible)
-    _say_gains(tried, current, say)
+    _say_gains(tried, current, pairs, say)
     able = {p: v for p, v in tried.items() if admissible(v, current, measured, noise)}
     everyone = list(tried.values())
     if not able:

@@ -343,7 +343,8 @@ class Round:
         equivalent: Other (effect, port) that these recordings cannot distinguish from it.
         parameters: Estimates of the parameters of the effect, by short name.
         stage: The model with the effect, refitted and evaluated.
-        score: Penalised score of the candidate [nat].
+        score: Penalised score of the candidate [nat]. NaN if it was refitted without a score: a law that
+            contains an effect with memory that is on, which no derivative distinguishes from it.
         held_out_gain_nats: Gain in log-likelihood of the validation recordings [nat].
         sentence: What was found, in words.
         equation: Equation of the effect.

@@ -18,7 +18,7 @@ from rotflex_jax.discover.batched_predictor import ParameterSet
 from rotflex_jax.discover.candidate_slopes import MOST_LINES, Slopes, candidate_sensitivities
 from rotflex_jax.discover.hypothesis import CandidateStart, Hypothesis
 from rotflex_jax.discover.likelihood import LikelihoodProblem
-from rotflex_jax.discover.supermodel import Candidate, EffectLocation, ErrorLine
+from rotflex_jax.discover.supermodel import Candidate, EffectLocation, ErrorLine, SuperModel
 from rotflex_jax.effects import CATALOG
 from rotflex_jax.fit.coordinates import FitCoordinates, Projection
 from rotflex_jax.latent.in_time import periodic_torques
@@ -85,6 +85,17 @@ def residual_lines(problem: LikelihoodProblem, h: Hypothesis) -> tuple[ErrorLine
     return tuple(chosen[:MOST_LINES])
 
 
+def candidates_to_score(
+    s: SuperModel, h: Hypothesis, lines: Sequence[ErrorLine]
+) -> dict[EffectLocation, Candidate]:
+    """Candidates that are not yet in a hypothesis, by location.
+
+    A periodic disturbance has one shape for each line; without lines it is not among them.
+    """
+    absent = (c.at_lines(lines) for location, c in s.candidates.items() if location not in h.locations)
+    return {c.location: c for c in absent if c}
+
+
 def score_test(problem: LikelihoodProblem, h: Hypothesis, lines: Sequence[ErrorLine] = ()) -> "ScoreTest":
     """The score test of all candidates that are not yet in a hypothesis.
 
@@ -94,8 +105,7 @@ def score_test(problem: LikelihoodProblem, h: Hypothesis, lines: Sequence[ErrorL
         lines: Lines at which a periodic disturbance is tried; without lines none is tried.
     """
     s, seen = problem.supermodel, problem.seen
-    absent = [c for c in s.candidates.values() if c.location not in h.locations]
-    tried = {c.location: found for c in absent if (found := c.at_lines(lines))}
+    tried = candidates_to_score(s, h, lines)
     candidates = list(tried.values())
     if not candidates:
         return ScoreTest([], {}, None)
@@ -121,7 +131,7 @@ def score_test(problem: LikelihoodProblem, h: Hypothesis, lines: Sequence[ErrorL
     r = orthogonal(w[None])[0]
     projected = _Projected(r, columns, problem.measured_values, max(headroom, 1.0))
     listed = sorted((_score(c, projected) for c in candidates), key=lambda found: -found.nats)
-    return ScoreTest(listed, {c.location: c for c in candidates}, projected)
+    return ScoreTest(listed, tried, projected)
 
 
 def _changes(

@@ -131,7 +131,7 @@ def discover(
             state = fit_as_it_is(model, horizons, say, digest)
         else:
             state = as_it_was(model, horizons, say, digest, resume)
-        state.reading_notes += left_out
+        state.reading_notes += (*left_out, *_not_tried(candidates or (), supermodel))
         while len(state.scores) < rounds:
             # 3. Score all candidates.
             promising = score_candidates(state)
@@ -171,6 +171,13 @@ def _with_signals(
     known = dict.fromkeys((*model.mechanism.signals, *common))
     model = dataclasses.replace(model, mechanism=model.mechanism.with_signals(tuple(known)))
     return model, (note,) if apart else ()
+
+
+def _not_tried(candidates: Iterable[tuple[type[Effect], str]], s: SuperModel) -> tuple[str, ...]:
+    """A sentence on given candidates that a search does not try."""
+    names = [effect_phrase(cls.name, at) for cls, at in candidates if (cls.name, at) not in s.candidates]
+    reason = "the model has them, every search fits them, or they state no size at which to try them"
+    return (f"Not among the candidates, since {reason}: {', '.join(names)}.",) if names else ()
 
 
 def _kind_of_programs(horizons: Horizons) -> tuple[Any, ...]:

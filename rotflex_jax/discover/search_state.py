@@ -132,19 +132,25 @@ class SearchState:
         return Reach.of(self.model, self.problem.dataset.recordings)
 
     def is_plausible(self, h: Hypothesis, location: EffectLocation) -> bool:
-        """Whether the parameters of an effect are physical, and of sizes that the recordings reach.
+        """Whether nothing speaks against the parameters of an effect; see `fault`."""
+        return not self.fault(h, location)
+
+    def fault(self, h: Hypothesis, location: EffectLocation) -> str:
+        """Why an effect is not physical, or not of a size that the recordings reach; empty if it is both.
 
         A sensor is not physical if readings as large as the recorded ones correspond to no true value. An
         effect is not plausible either if an offset cancels a part of it (`_needs_large_offset`).
         """
         s = self.problem.supermodel
-        if not is_physical(s, h, location) or self._needs_large_offset(h):
-            return False
+        if not is_physical(s, h, location):
+            return "a parameter is outside its physical range"
+        if self._needs_large_offset(h):
+            return "an offset far beyond the usual cancels a part of it"
         m = s.clean(h.mean_values(s), h.locations)
         effect = m.effect(*location)
         if isinstance(effect, Sensing) and self.reach.position[effect.at] > effect.largest_reading():
-            return False
-        return not beyond_recordings(m, self.reach, [effect])
+            return "such a sensor could not read what was recorded"
+        return next((remark.sentence for remark in beyond_recordings(m, self.reach, [effect])), "")
 
     def _needs_large_offset(self, h: Hypothesis) -> bool:
         """Whether an offset is far beyond its typical size, and over twice as large as in the present model.

@@ -1,6 +1,7 @@
 """The result of a search: evaluated nested models, localised errors of the baseline, and the verdict."""
 
 import dataclasses
+import math
 import time
 from collections.abc import Mapping, Sequence
 
@@ -297,7 +298,7 @@ def _rounds(
             equivalent=tuple(state.rivals.get(location, [])),
             parameters=own_estimates(stage, location),
             stage=stage,
-            score=state.scores.get(location, state.worth.get(location, 0.0)),
+            score=state.scores.get(location, state.worth.get(location, math.nan)),
             held_out_gain_nats=_gain_of_predictions(state, location, stage, before),
             sentence=mechanism.sentence(mechanism.effect(*location)),
             equation=mechanism.effect(*location).equation,

@@ -9,7 +9,7 @@ from typing import Any
 
 from rotflex_jax.discover.explanation import Explanation
 from rotflex_jax.discover.learned_torque import LearnedTorqueResult
-from rotflex_jax.discover.result import Ranked, SearchResult, Where
+from rotflex_jax.discover.result import Ranked, Round, SearchResult, Where
 from rotflex_jax.discover.tables import (
     FITTED_TO_ALL,
     Outcome,
@@ -30,6 +30,7 @@ from rotflex_jax.discover.tables import (
     where_sentence,
 )
 from rotflex_jax.discover.verdict import FAR_FLOOR, NEAR_FLOOR, Grade, grade
+from rotflex_jax.effects import CATALOG
 from rotflex_jax.effects.labels import effect_label, effect_title, sentence
 from rotflex_jax.parameters import HALF_WIDTH_95, Estimate
 from rotflex_jax.recording import Recording
@@ -88,6 +89,7 @@ def content(discovery: SearchResult, explanation: Explanation) -> dict[str, Any]
         "remaining": _places(remaining),
         "arises": any("arises" in w.statement for w in (*discovery.where, *remaining)),
         "ranking": [_ranked(r, outcome) for r, outcome in outcomes(discovery)],
+        "has_line": any(CATALOG[r.effect].line for r in discovery.ranking if r.effect in CATALOG),
         "hidden": sum(not r.excited for r in discovery.ranking),
         "parameters": parameter_rows(discovery),
         "known": [together(s) for s in explanation.known.sentences] if explanation.known else [],
@@ -158,12 +160,19 @@ def _round(discovery: SearchResult, k: int) -> dict[str, Any]:
         "sentence": sentence(description_in_use(discovery, added)),
         "equation": equation(added.equation),
         "parameters": parameters,
-        "gain": _with_sign(added.held_out_gain_nats) if math.isfinite(added.held_out_gain_nats) else "",
+        "evidence": _evidence(added),
         "status_sentence": status_sentence(added),
         "is_established": added.status == "established",
-        "score": plain_number(added.score),
         "falls": ", ".join(falls),
     }
+
+
+def _evidence(added: Round) -> str:
+    """Gain and score of an effect in a sentence; what is not known is left out."""
+    gain, score = added.held_out_gain_nats, added.score
+    parts = [f"log-likelihood of validation data {_with_sign(gain)} nat"] if math.isfinite(gain) else []
+    parts += [f"score {plain_number(score)} nat"] if math.isfinite(score) else []
+    return sentence(", ".join(parts))
 
 
 def _test_lines(explanation: Explanation) -> list[str]:
