@@ -119,9 +119,13 @@ def test_an_offset_that_two_runs_share_is_the_machine_s(parts):
     assert OFFSET in found.model.mechanism.parameter_names
 
 
-def test_a_torque_is_learned_only_beside_validation_data(found):
+def test_a_torque_is_learned_only_beside_validation_data(found, tmp_path):
     alone = dataclasses.replace(found, validation=found.train)
     with pytest.raises(InputError, match="needs validation data"):
         alone.learned_torque()
+    said: list[str] = []
     with pytest.raises(InputError, match="needs validation data"):
-        alone.explanation(learned=True)
+        alone.explanation(learned=True, progress=said.append)
+    with pytest.raises(InputError, match="needs validation data"):
+        alone.report(tmp_path / "report", learned=True, progress=said.append)
+    assert not said and not (tmp_path / "report").exists()  # refused before any work

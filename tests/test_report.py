@@ -810,6 +810,17 @@ def test_errors_of_which_most_was_used_for_the_offsets_say_so(discovery) -> None
     )
 
 
+def test_recordings_of_one_window_say_that_both_errors_are_the_same(discovery) -> None:
+    def note(*lengths: int) -> str:
+        recordings = tuple(moved(n) for n in lengths)
+        return error_lists(dataclasses.replace(discovery, rounds=(), validation=recordings))[0].note
+
+    said = "Each recording is one window, so errors over 2 s are those of one run over all of it."
+    assert discovery.baseline.window_seconds == 2.0
+    assert note(400).endswith(said) and note(400, 300).endswith(said)  # at 200 Hz
+    assert said not in note(600) and said not in note(400, 600)
+
+
 def test_the_share_that_is_a_candidates_own_is_a_plain_number(discovery, undrawn) -> None:
     shares = (0.997, 0.00041)
     first = [dataclasses.replace(r, unconfounded=x) for r, x in zip(discovery.ranking, shares, strict=False)]

@@ -89,16 +89,27 @@ class Discovery(SearchResult):
         Raises:
             InputError: If the search had no validation data, by which the smoothness of the map is chosen.
         """
-        if not self.held_back:
-            raise InputError(
-                "A learned torque needs validation data, but the training recordings of this search validate "
-                "each other; give `rf.discover` a recording as its `validation`."
-            )
+        self._learns(True)  # refuses without validation data
         seconds, m = self.baseline.window_seconds, self.final.model.mechanism  # not fitted to validation data
         for effect in [e for e in m.effects if e.line]:  # its phase belongs to one recording
             m = m.without(effect.name, effect.at)
         model = Model(m, self.final.model.solver)
         return learn_torque(model, self.train, self.validation, at, window_seconds=seconds, progress=progress)
+
+    def _learns(self, learned: bool | None) -> bool:
+        """Whether a report learns a torque, given what the user asks for.
+
+        Raises:
+            InputError: It is asked for, but there are no validation data.
+        """
+        if learned is None:
+            return self.verdict == Verdict.UNEXPLAINED and self.held_back
+        if checks.yes_or_no(learned, "learned") and not self.held_back:
+            raise InputError(
+                "A learned torque needs validation data, but the training recordings of this search validate "
+                "each other; give `rf.discover` a recording as its `validation`."
+            )
+        return learned
 
     def identifiability(self) -> Identifiability | None:
         """Identifiability of the model to use from its sensors and the longest training recording.
@@ -126,18 +137,14 @@ class Discovery(SearchResult):
         Raises:
             InputError: If a torque is to be learned without validation data.
         """
-        say = checks.progress(progress)
+        say, learned = checks.progress(progress), self._learns(learned)
         say("report: torques that the models lack")
         latent, torque = self.latent_torque(progress), None
-        if learned is None:
-            learned = self.verdict == Verdict.UNEXPLAINED and self.held_back
         if learned:
             gains = (latent.after or latent.before).gain_nats
             try:
                 torque = self.learned_torque(max(gains, key=lambda port: gains[port]), progress)
             except InputError:
-                if not self.held_back:
-                    raise
                 torque = None  # the sensors do not determine the motion of that port
         say("report: tests of the residuals and frequency responses")
         tests = model_tests(self)
@@ -229,10 +236,13 @@ class Discovery(SearchResult):
             learned: Whether to learn a torque for what is left, which takes about as long as a round; if
                 None, it is learned if the verdict is `unexplained`.
             progress: Called with a line of text at each stage.
+
+        Raises:
+            InputError: If a torque is to be learned without validation data; nothing is written then.
         """
         from rotflex_jax.report import write_report  # the layer above, on request
 
-        folder = Path(folder)
+        folder, learned = Path(folder), self._learns(learned)
         # The result is written first, so that it is kept whatever fails below.
         write_files(folder, {"result.json": as_json(self.to_dict())})
         explanation = self.explanation(learned, progress)

@@ -19,6 +19,7 @@ from rotflex_jax.discover.result import (
 from rotflex_jax.discover.verdict import Grade, Verdict, grade
 from rotflex_jax.effects.base import full_name
 from rotflex_jax.effects.labels import effect_label, effect_phrase
+from rotflex_jax.metrics import window_starts
 from rotflex_jax.models.model import Model
 from rotflex_jax.parameters import Estimate
 from rotflex_jax.recording import Recording
@@ -137,16 +138,25 @@ def error_lists(discovery: SearchResult) -> list[NamedErrors]:
         _mostly_calibrated(stages[0].calibrate_seconds, recordings, what)
         for recordings, what in ((discovery.validation, "validation"), (discovery.test, "test"))
     )
+    same, same_tested = (
+        _one_window(stages[0].window_seconds, recordings)
+        for recordings in (discovery.validation, discovery.test)
+    )
     listed = [
         (
             "Validation data",
-            chose,
+            chose + same,
             [RunErrors(s.held_out_rmse, s.held_out_rmse_windows) for s in stages],
             None,
         ),
-        ("Validation data" + own, chose + short, [s.calibrated for s in stages], None),
-        ("Test data", not_used, [s.test for s in stages], tested[0]),
-        ("Test data" + own_tested, not_used + short_tested, [s.test_calibrated for s in stages], tested[1]),
+        ("Validation data" + own, chose + same + short, [s.calibrated for s in stages], None),
+        ("Test data", not_used + same_tested, [s.test for s in stages], tested[0]),
+        (
+            "Test data" + own_tested,
+            not_used + same_tested + short_tested,
+            [s.test_calibrated for s in stages],
+            tested[1],
+        ),
     ]
     found = []
     for title, note, of_stages, of_fit in listed:
@@ -169,6 +179,13 @@ def _own_offsets(seconds: float, recordings: Sequence[Recording]) -> str:
         return f"offsets fitted to all of it, which is no longer than {seconds:g} s"
     ending = f", which is all of it in {short} of {count}" if short else ""
     return f"the offsets of its own first {seconds:g} s{ending}"
+
+
+def _one_window(seconds: float, recordings: Sequence[Recording]) -> str:
+    """A sentence where every recording is one window, so that both kinds of error are equal; else empty."""
+    if any(len(window_starts(r, seconds)[0]) > 1 for r in recordings):
+        return ""
+    return f" Each recording is one window, so errors over {seconds:g} s are those of one run over all of it."
 
 
 def _mostly_calibrated(seconds: float, recordings: Sequence[Recording], what: str) -> str:
