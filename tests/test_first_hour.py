@@ -650,7 +650,7 @@ def test_messages_name_the_fault_and_options_of_the_command_line(run, tmp_path) 
     found.write_text(json.dumps({"schema": 1, "verdict": "found", "baseline": {}, "rounds": [{"a": 1}]}))
     for line, words in (
         (("check", file, "--output", "gamma=alpha"), ("--output theta=COLUMN",)),
-        (("check", file, "--Ts", 0.004), ("leave --Ts out",)),
+        (("check", file, "--Ts", 0.004), ("leave --Ts 0.004 out",)),
         (("check", counted, "--counts", 4096, "--degrees"), ("--counts 4096 and --degrees",)),
         (("discover", file, "--save-model"), ("rotflex discover --help",)),
         (("simulate", file, "--model", found), ("is the result of a search", "`--save-model`")),
@@ -666,7 +666,7 @@ def test_messages_name_the_fault_and_options_of_the_command_line(run, tmp_path) 
     frame(alpha=-ALPHA).to_csv(file, index=False)
     status, _, err = run("check", file)
     assert status == 2
-    assert_one_sentence(err, "starting values nearer to the machine, such as --joint paper:")
+    assert_one_sentence(err, "starting values nearer to the machine, such as --joint paper:stiffness=1.2.")
 
 
 def test_a_table_is_no_recording() -> None:

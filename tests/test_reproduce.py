@@ -441,7 +441,7 @@ def test_recordings_that_do_not_fit_are_refused(run: Callable, tmp_path: Path) -
     for arguments, word in (
         (("--data", file), "longer recording"),
         (("--data", file, "--set", "Ts=0.03"), "multiple"),
-        (("--data", file, "--set", "Ts=0.001"), "multiple"),
+        (("--data", file, "--set", "Ts=0.001"), "multiple of that; give --set Ts="),
         (("--data", file, "--output", "theta"), "deflection"),
         (("--data", file, "--data", file), "twice"),
         (("--data", file, "--out", file), "folder"),

@@ -362,7 +362,10 @@ def one_model(given: Sequence[str] | None) -> str:
 
 
 def as_options(sentence: str) -> str:
-    """A sentence about arguments in Python, in terms of the options of the command line."""
+    """A sentence about arguments in Python, in terms of the options of the command line.
+
+    It reads names of arguments and calls as Python writes them, and no other words of a sentence.
+    """
     sentence = re.sub(r"accept=\('(\w+)',\)", r"--accept \1", sentence)
     sentence = sentence.replace("degrees=True", "--degrees")
     sentence = re.sub(r"\bunits=\{'(\w+)': '([^']+)'\}", r'--output "\1 [\2]=COLUMN"', sentence)
@@ -371,15 +374,11 @@ def as_options(sentence: str) -> str:
     sentence = re.sub(r"\btime_unit=(?!')", "--time-unit", sentence)
     sentence = re.sub(r"\bresample='?(\w+)'?", r"--resample \1", sentence)
     sentence = re.sub(r"\bcounts=\{'(\w+)': (\d+)\}", r"--counts \1=\2", sentence)
-    # "set Ts=" is about a setting of `rotflex reproduce`.
-    sentence = re.sub(r"(?<!set )\b(input|time|Ts|counts)=(?=\d)", r"--\1 ", sentence)
-    sentence = sentence.replace("leave Ts out", "leave --Ts out")
+    sentence = re.sub(r"\bSettings\((\w+=[^()]+)\)", r"--set \1", sentence)
+    sentence = re.sub(r"(?<!--set )\b(input|time|Ts|counts)=(?=\d)", r"--\1 ", sentence)
     sentence = re.sub(r"\boutputs=\{'(\w+)': 'COLUMN'\}", r"--output \1=COLUMN", sentence)
-    sentence = sentence.replace(
-        "the model starting values nearer to the machine",
-        "starting values nearer to the machine, such as --joint paper:stiffness=1.2",
-    )
-    sentence = re.sub(r"(?<!set )\b(input|time|Ts)=", r"--\1", sentence)
+    sentence = sentence.replace("model.with_values({...})", "--joint paper:stiffness=1.2")
+    sentence = re.sub(r"(?<!--set )\b(input|time|Ts)=", r"--\1", sentence)
     sentence = re.sub(r"\boutputs=|Argument `outputs`", "--output", sentence)
     sentence = re.sub(r"\bsignals=|Argument `signals`", "--signal", sentence)
     sentence = re.sub(r"a mapping such as \{'([^']+)': '(\w+)'\}", r'for instance "\1=\2"', sentence)

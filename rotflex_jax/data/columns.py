@@ -385,7 +385,8 @@ def timing(
     measured = even_spacing(t, label, table.where, table.first)
     if Ts is not None and abs(measured - Ts) > 0.01 * Ts:
         raise InputError(
-            f"{label} advances by {measured:g} s, but Ts={Ts:g} was given; leave Ts out, or correct it."
+            f"{label} advances by {measured:g} s, but Ts={Ts:g} was given; leave Ts={Ts:g} out, or correct "
+            "it."
         )
     if measured >= SLOWEST_SAMPLING and not any_unit and time_unit is None:
         raise InputError(

@@ -126,8 +126,8 @@ def check_signs(model: Model, recordings: Sequence[Recording]) -> None:
     verb = "moves" if len(against) == 1 else "move"
     raise InputError(
         f"{names} {verb} against what the model would do under this input (correlation {worst:.2f}), as with "
-        f"a sign turned round; negate {what} if that is so, or give the model starting values nearer to the "
-        "machine."
+        f"a sign turned round; negate {what} if that is so, or give starting values nearer to the machine, "
+        "such as model.with_values({...})."
     )
 
 

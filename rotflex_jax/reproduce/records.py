@@ -278,7 +278,7 @@ def _decimated(s: Settings, recording: Recording, name: str) -> list[Recording]:
     if k < 1 or abs(k * recording.Ts / s.Ts - 1) > 0.02:
         raise InputError(
             f"{where} is sampled every {recording.Ts:g} s, but Ts is {s.Ts:g} s, which must be a multiple of "
-            f"that; set Ts={max(1, k) * recording.Ts:g}."
+            f"that; give Settings(Ts={max(1, k) * recording.Ts:g})."
         )
     y = recording.channel(name)[:, None]
     unit = recording.unit(name)
