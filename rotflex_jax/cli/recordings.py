@@ -99,7 +99,11 @@ class Columns:
         return model, dataclasses.replace(self, mechanism=model.mechanism)
 
     def load(self, file: Path) -> "Recording":
-        """The recording in a file."""
+        """The recording in a file, in the units of the model.
+
+        `Model.measured` refuses an angle in degrees for radians alone, since a recording made in Python may
+        name its units as it likes. Here any other unit is refused: a file is read by those of the model.
+        """
         if not file.exists():
             raise InputError(f"{file} does not exist; give the path of a recording.")
         from rotflex_jax.data import load

@@ -360,8 +360,13 @@ def _beyond(remarks: Sequence[Remark], location: EffectLocation) -> tuple[str, .
 def _doubts(
     state: SearchState, location: EffectLocation, pairs: Sequence[PairedEstimates]
 ) -> tuple[str, ...]:
-    """Reasons why an effect that is distinguished from others may still stand in for something else."""
-    if location not in state.gains:  # a calibration, which other tests have established
+    """Reasons why an effect that is distinguished from others may still stand in for something else.
+
+    There are none for a calibration of the machine. Two other tests have established it: training data are
+    likelier with it by more than the penalty for its values (`eliminate`), and free runs over validation data
+    are clearly better with its trained value (`assign_calibrations`).
+    """
+    if location not in state.gains:
         return ()
     reasons = []
     prediction, runs = state.gains[location]
