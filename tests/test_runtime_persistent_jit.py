@@ -390,6 +390,18 @@ def test_nothing_is_stored_where_none_is_to_be_kept(folder: Path, monkeypatch: p
     assert not files(folder)
 
 
+@pytest.mark.parametrize("kept", [True, False])
+def test_a_program_runs_on_constants_inside_of_another_program(folder: Path, kept: bool) -> None:
+    keep_programs(folder if kept else False)
+    try:
+        program = new()
+        for x in (1.0, 2.0):  # made in the first trace, in memory in the second
+            outer = jax.jit(lambda given, x=x: given + program(x, np.ones(1))[0])
+            assert outer(1.0) == 1.0 + x
+    finally:
+        keep_programs(True)
+
+
 def test_a_folder_may_be_chosen_and_the_usual_one_is_the_users(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

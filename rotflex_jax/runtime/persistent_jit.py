@@ -230,15 +230,13 @@ class PersistentJit:
         if stored is not None:
             _count(loaded=1)
             return stored
-        if file is None:
-            with _without_garbage_collection:
-                result = program(*leaves)
-            _count(compiled=1, seconds=time.perf_counter() - began)
-            return program, result
+        # Compiled here even where it is not kept: inside of another program, which may hold these arguments
+        # as constants, JAX compiles nothing with options.
         with _without_garbage_collection:
             compiled = program.lower(*leaves).compile()
         _count(compiled=1, seconds=time.perf_counter() - began)
-        _write(compiled, file)
+        if file is not None:
+            _write(compiled, file)
         return compiled, compiled(*leaves)
 
 
