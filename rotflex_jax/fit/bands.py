@@ -26,6 +26,7 @@ from rotflex_jax.mechanism import Mechanism, linearise
 from rotflex_jax.mechanism.assembly import Layout, effects_of
 from rotflex_jax.mechanism.linear import inverse_mass, output_units, process_covariance
 from rotflex_jax.models.model import Model
+from rotflex_jax.optimise.damped_least_squares import NormalEquations, Rules, minimise
 from rotflex_jax.parameters import Estimate
 from rotflex_jax.recording import Recording
 from rotflex_jax.recording.recording import SHORTEST_TO_FIT, listed, single
@@ -47,9 +48,8 @@ PARTS = (
 """Sources of uncertainty that widen a band, in the order of tables."""
 # A recording starts at rest if its first speeds are below this share of the root mean square speeds.
 AT_REST = 0.02
-# Largest number of steps of the fit of a first state, of halvings of a step, and least gain of a step
-# [squared error in units of the noise].
-FIRST_STATE_STEPS, HALVED_STEPS, ENOUGH_GAIN = 12, 4, 0.1
+# Rules of the fit of a first state, whose cost is in nats, and its largest number of steps.
+FIRST_STATE_RULES, FIRST_STATE_STEPS = Rules(enough=0.05, largest=1e4), 16
 # Standard deviation, in ranges of the measured motion, from which on propagation to first order is
 # meaningless.
 MOST_RANGES = 100
@@ -472,43 +472,23 @@ def _first_state(
         n_init: Number of samples that are used.
         parameters: Number of columns of the slopes that belong to parameters; they come first.
     """
-    moving = len(start) - len(unseen)
+    moving, memories = len(start) - len(unseen), unseen.shape[1]
 
     def state(x: np.ndarray) -> np.ndarray:
         return start + np.concatenate([x[:moving], unseen @ x[moving:]])
 
-    def evaluated(x: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+    @np.errstate(over="ignore", invalid="ignore")  # of a run that diverges, whose step is refused
+    def equations(x: np.ndarray) -> NormalEquations:
         y_hat, J = run(state(x))
-        e = ((y - y_hat) / noise)[:n_init].ravel()
+        e = ((y_hat - y) / noise)[:n_init].ravel()
         S = (J[:n_init, :, parameters:] / noise[:, None]).reshape(len(e), -1)
-        c = np.concatenate([np.zeros(moving), x[moving:]])
-        finite = np.isfinite(e).all() and np.isfinite(S).all()
-        return (float(e @ e + c @ c) if finite else np.inf), e, S
+        prior = np.eye(memories, moving + memories, moving)
+        return NormalEquations.of(np.vstack([S, prior]), np.concatenate([e, x[moving:]]))
 
-    best, least = np.zeros(moving + unseen.shape[1]), np.inf
-    axes = np.eye(len(best))[moving:]
-    for x in (0.0 * best, *axes, *-axes):  # for example, play may rest on either side
-        cost, e, S = evaluated(x)
-        for _ in range(FIRST_STATE_STEPS):
-            if not np.isfinite(cost):
-                break
-            prior = np.diag([0.0] * moving + [1.0] * unseen.shape[1])
-            H = S.T @ S + prior
-            step = np.linalg.lstsq(H, S.T @ e - prior @ x, rcond=1e-12)[0]
-            for _ in range(HALVED_STEPS):
-                tried = evaluated(x + step)
-                if tried[0] < cost:
-                    break
-                step = step / 2
-            else:
-                break
-            gained, x = cost - tried[0], x + step
-            cost, e, S = tried
-            if gained < ENOUGH_GAIN:
-                break
-        if cost < least:
-            best, least = x, cost
-    return state(best)
+    axes = np.eye(moving + memories)[moving:]
+    starts = (np.zeros(moving + memories), *axes, *-axes)  # for example, play may rest on either side
+    ends = [minimise(equations, x, FIRST_STATE_RULES, max_steps=FIRST_STATE_STEPS) for x in starts]
+    return state(min(ends, key=lambda end: end.cost if np.isfinite(end.cost) else np.inf).x)
 
 
 def _finite(covariance: np.ndarray) -> np.ndarray:
