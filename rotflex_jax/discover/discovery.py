@@ -37,14 +37,14 @@ from rotflex_jax.effects.labels import effect_label, sentence
 from rotflex_jax.errors import InputError
 from rotflex_jax.experiment import Experiment
 from rotflex_jax.experiment.until_decided import models_of
-from rotflex_jax.fit.bands import Bands, checked_level, known_recordings
+from rotflex_jax.fit.bands import Bands, checked_level
 from rotflex_jax.fit.greybox import fit
 from rotflex_jax.fit.identifiable import Identifiability, identifiable
 from rotflex_jax.fit.result import Fit
 from rotflex_jax.models.model import Model
 from rotflex_jax.models.model_json import Saved, save
 from rotflex_jax.recording import Recording
-from rotflex_jax.recording.recording import SHORTEST_TO_FIT, single
+from rotflex_jax.recording.recording import SHORTEST_TO_FIT, listed_if_given, single
 from rotflex_jax.text.markup import as_json, bullets, card, folded, paragraph, picture, table, write_files
 from rotflex_jax.text.numbers import equation, plain_number, readable, unit_text, value_and_interval
 from rotflex_jax.text.svg import staircase
@@ -187,7 +187,8 @@ class Discovery(SearchResult):
                 runs, unless the recording is of the only run that was trained.
         """
         recording = single(recording, "recording", shortest=SHORTEST_TO_FIT)
-        say, level, others = checks.progress(progress), checked_level(level), known_recordings(known)
+        say, level = checks.progress(progress), checked_level(level)
+        others = listed_if_given(known, "known", SHORTEST_TO_FIT)
         if self.final_fit:
             return bands_of_final_fit(self, recording, level, others)
         differs = ", ".join(self.final.friction_of_runs)

@@ -49,7 +49,13 @@ from rotflex_jax.mechanism import Exponential, Mechanism
 from rotflex_jax.mechanism.roles import search_places
 from rotflex_jax.models.model import Model, program_length
 from rotflex_jax.recording import Recording
-from rotflex_jax.recording.recording import SHORTEST_TO_FIT, check_apart, common_signals, listed
+from rotflex_jax.recording.recording import (
+    SHORTEST_TO_FIT,
+    check_apart,
+    common_signals,
+    listed,
+    listed_if_given,
+)
 from rotflex_jax.runtime.persistent_jit import clear_compilation_caches, loaded_ahead
 from rotflex_jax.runtime.xla import on_threads, one_thread
 
@@ -114,8 +120,9 @@ def discover(
     checks.positive(window_seconds, "window_seconds")
     checks.number(calibrate_seconds, "calibrate_seconds", least=0, unit="s", example="2.0")
     # 1. Prepare: one super-model with every candidate built in, the recordings at both horizons.
-    trained, held_back = listed(train, "train", SHORTEST_TO_FIT), _several(validation, "validation")
-    tested = _several(test, "test")
+    trained = listed(train, "train", SHORTEST_TO_FIT)
+    held_back = listed_if_given(validation, "validation", SHORTEST_TO_FIT)
+    tested = listed_if_given(test, "test", SHORTEST_TO_FIT)
     model, left_out = _with_signals(model, (*trained, *held_back), tested)
     if candidates is not None:
         candidates = checked_candidates(model.mechanism, candidates)
@@ -187,12 +194,6 @@ def _kind_of_programs(horizons: Horizons) -> tuple[Any, ...]:
     problem = sets[0]
     windows = padded_windows(problem.windows.number)
     return problem.supermodel.mechanism.structure, problem.predictor.solver, shapes, windows
-
-
-def _several(recordings: Recording | Sequence[Recording] | None, name: str) -> tuple[Recording, ...]:
-    if recordings is None or (isinstance(recordings, Sequence) and not len(recordings)):
-        return ()
-    return listed(recordings, name, SHORTEST_TO_FIT)
 
 
 def _prepare(

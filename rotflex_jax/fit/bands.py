@@ -29,7 +29,7 @@ from rotflex_jax.models.model import Model
 from rotflex_jax.optimise.damped_least_squares import NormalEquations, Rules, minimise
 from rotflex_jax.parameters import Estimate
 from rotflex_jax.recording import Recording
-from rotflex_jax.recording.recording import SHORTEST_TO_FIT, listed, single
+from rotflex_jax.recording.recording import SHORTEST_TO_FIT, listed_if_given, single
 from rotflex_jax.text.markup import card, paragraph, table
 from rotflex_jax.text.numbers import plain_number, readable
 
@@ -207,7 +207,7 @@ def prediction_bands(
     Vovk, A. Gammerman and G. Shafer, Algorithmic Learning in a Random World, 2005 (width by known errors).
     """
     recording = single(recording, "recording", shortest=SHORTEST_TO_FIT)
-    level, others = checked_level(level), known_recordings(known)
+    level, others = checked_level(level), listed_if_given(known, "known", SHORTEST_TO_FIT)
     sources = []
     for fit, weight in _weighted(fitted):
         values = fit.model.mechanism.named_values
@@ -286,12 +286,6 @@ def mixed_bands(sources: Sequence[BandSource], recording: Recording, level: floa
         upper=upper,
         parts={name: np.sqrt(v) for name, v in combined.items() if np.any(v > 0)},
     )
-
-
-def known_recordings(known: Any) -> tuple[Recording, ...]:
-    """The recordings of an argument `known`, which may be empty."""
-    none = isinstance(known, Sequence) and len(known) == 0
-    return () if none else tuple(listed(known, "known", shortest=SHORTEST_TO_FIT))
 
 
 def _weighted(fitted: Any) -> list[tuple[Fit, float]]:

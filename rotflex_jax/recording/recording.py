@@ -597,6 +597,12 @@ read a file with rotflex_jax.load.
     return found
 
 
+def listed_if_given(recordings: Any, name: str, shortest: int = 1) -> tuple[Recording, ...]:
+    """As `listed`, for an argument that may be None or empty."""
+    none = recordings is None or (isinstance(recordings, Sequence) and not len(recordings))
+    return () if none else listed(recordings, name, shortest)
+
+
 def single(recording: Any, name: str = "recording", shortest: int = 1) -> Recording:
     """The one recording that was given, alone or in a list.
 
