@@ -73,8 +73,10 @@ def _score(
             f"Argument `n_init` must leave samples to score, but is {start} of {len(measured)} "
             "samples; give a smaller one."
         )
-    measured = measured[start:]
-    values = formula(measured, measured - modelled[start:])
+    # Differences and squares of counts or of half precision may overflow in their own type.
+    least = lambda a: float if a.dtype.kind in "iu" else np.float32  # noqa: E731
+    measured, modelled = (a[start:].astype(np.result_type(a, least(a))) for a in (measured, modelled))
+    values = formula(measured, measured - modelled)
     if channels is None:
         return values
     return {name: float(value) for name, value in zip(channels, values, strict=True)}
@@ -87,7 +89,7 @@ def _ratio(part: Any, whole: Any) -> Any:
 
 
 def _rms(y: np.ndarray, e: np.ndarray) -> Any:
-    return np.sqrt(np.mean(e**2, axis=0))
+    return np.sqrt(np.mean(np.abs(e) ** 2, axis=0))
 
 
 def _relative(y: np.ndarray, e: np.ndarray) -> Any:

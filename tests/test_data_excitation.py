@@ -20,6 +20,11 @@ def test_every_input_has_its_samples_and_is_finite(kind: str) -> None:
     assert np.ptp(u) > 0
 
 
+@pytest.mark.parametrize("kind", INPUTS)
+def test_number_of_samples_may_come_from_a_division(kind: str) -> None:
+    np.testing.assert_array_equal(INPUTS[kind](10 / Ts, Ts), INPUTS[kind](1000, Ts))
+
+
 @pytest.mark.parametrize("kind", SEEDED)
 def test_seed_decides(kind: str) -> None:
     first = INPUTS[kind](500, Ts, seed=1)

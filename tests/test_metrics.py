@@ -55,6 +55,20 @@ def test_recording_brings_its_channels_and_its_initial_samples(name: str) -> Non
     np.testing.assert_array_equal(list(values.values()), metric(recording.y, y_hat, recording.n_init))
 
 
+@pytest.mark.parametrize("kind", ["uint8", "int16", "float16", "float32"])
+@pytest.mark.parametrize("name", BY_HAND)
+def test_counts_in_a_narrow_type_do_not_overflow(name: str, kind: str) -> None:
+    y, y_hat = np.array([250, 3, 10, 200]), np.array([2, 251, 10, 100])
+    if kind != "uint8":
+        y, y_hat = 100 * y, 100 * y_hat
+    metric = getattr(metrics, name)
+    assert metric(y.astype(kind), y_hat.astype(kind)) == pytest.approx(metric(y * 1.0, y_hat * 1.0), rel=1e-3)
+
+
+def test_size_of_a_complex_error_counts() -> None:
+    assert metrics.rmse([3j, 4.0], [0.0, 0.0]) == pytest.approx(np.sqrt(12.5))
+
+
 def test_errors_in_windows_by_hand() -> None:
     """Windows of 20 samples, 8 of them not scored; a rest of 16 joins the last window, one of 17 does not."""
     starts = {56: [0, 20], 57: [0, 20, 40]}

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 from rotflex_jax.basis.bank import Bank
 from rotflex_jax.basis.orthonormal import Orthonormal, SectionKinds, coordinates, numbers_of, poles_of
 from rotflex_jax.basis.volterra import Volterra
-from rotflex_jax.checks import signal, whole
+from rotflex_jax.checks import seed as checked_seed, signal, whole
 from rotflex_jax.errors import InputError
 from rotflex_jax.runtime.xla import double_precision
 
@@ -101,6 +101,11 @@ def fir_nmse(impulse_response: Any, autocovariance: Any = (1.0,), first: int = 0
     first = whole(first, "first", 0)
     r = _lags(autocovariance, len(h))
     power = _power(h, r)
+    if first >= len(h):
+        raise InputError(
+            f"The first delay is {first}, but the impulse response has {len(h)} samples, so that no delay is "
+            "left; give a smaller `first`."
+        )
     p = scipy.linalg.matmul_toeplitz(r, h)[first:]
     root = scipy.linalg.cholesky(scipy.linalg.toeplitz(r[: len(p)]), lower=True)
     # The first M entries of the triangular solution are the solution for the first M taps.
@@ -117,6 +122,9 @@ def memory_for(nmse: float, impulse_response: Any, autocovariance: Any = (1.0,),
         autocovariance: Autocovariance of the input at lags from 0, zero beyond the last; white by default.
         first: Delay of the first tap [samples].
 
+    Raises:
+        InputError: No number of delays reaches this error.
+
     >>> memory_for(0.07, 0.5 ** np.arange(40))
     2
     """
@@ -124,7 +132,13 @@ def memory_for(nmse: float, impulse_response: Any, autocovariance: Any = (1.0,),
         raise InputError(
             f"Argument `nmse` must lie between 0 and 1, but is {nmse:g}; give for instance 0.01."
         )
-    return 1 + int(np.argmax(fir_nmse(impulse_response, autocovariance, first) <= nmse))
+    errors = fir_nmse(impulse_response, autocovariance, first)
+    if not np.any(errors <= nmse):
+        raise InputError(
+            f"An error of {nmse:g} was asked for, but all {len(errors)} delays from lag {first} on leave "
+            f"{errors[-1]:.3g}; begin with an earlier delay, or allow more."
+        )
+    return 1 + int(np.argmax(errors <= nmse))
 
 
 def best_laguerre(
@@ -349,7 +363,7 @@ def optimise_poles(
     chosen = Volterra(bank, degrees=degrees, constant=constant)
     repeat = whole(repeat, "repeat", 1)
     z, signs = coordinates(bank.kinds, np.asarray(bank.numbers))
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(checked_seed(seed))
     shifts = spread * rng.standard_normal((whole(starts, "starts", 1), len(z)))
     shifts[0] = 0.0
     residual = _Residual(bank.kinds, signs, chosen.chosen, constant, repeat)

@@ -47,7 +47,7 @@ def noise(N: int, Ts: float, *, rms: float = 1.0, bandwidth: float = 5.0, seed: 
     """
     from scipy.signal import lfilter  # takes long to import
 
-    _check_grid(N, Ts)
+    N, Ts = _checked_grid(N, Ts)
     _check_positive(rms=rms, bandwidth=bandwidth)
     a = np.exp(-2 * np.pi * bandwidth * Ts)
     w = rms * np.random.default_rng(checked_seed(seed)).standard_normal(N)
@@ -88,7 +88,7 @@ def multisine(
     >>> round(float(np.sqrt(np.mean(u**2))), 12)
     1.0
     """
-    _check_grid(N, Ts)
+    N, Ts = _checked_grid(N, Ts)
     _check_positive(rms=rms)
     _check_band(band, Ts)
     if N % whole(periods, "periods", 1):
@@ -138,7 +138,7 @@ def prbs(N: int, Ts: float, *, amplitude: float = 1.0, hold: float = 0.05, seed:
     """
     from scipy.signal import max_len_seq  # takes long to import
 
-    _check_grid(N, Ts)
+    N, Ts = _checked_grid(N, Ts)
     _check_positive(amplitude=amplitude, hold=hold)
     samples = max(1, round(min(hold / Ts, N)))
     order = max(6, int(np.ceil(np.log2(-(-N // samples) + 1))))
@@ -169,7 +169,7 @@ def steps(
     >>> np.unique(steps(50, 0.01, hold=(0.1, 0.1))).size
     5
     """
-    _check_grid(N, Ts)
+    N, Ts = _checked_grid(N, Ts)
     times = tuple(hold) if isinstance(hold, Sequence) and not isinstance(hold, str) and hold else (hold,)
     shortest, longest = sorted(positive(time, "hold", "s", "(0.15, 0.8)") for time in (times * 2)[:2])
     _check_positive(amplitude=amplitude)
@@ -193,7 +193,7 @@ def sweep(N: int, Ts: float, *, band: tuple[float, float] = (0.1, 12.0), amplitu
     >>> round(float(np.max(sweep(1000, 0.01, amplitude=3.0))), 2)
     3.0
     """
-    _check_grid(N, Ts)
+    N, Ts = _checked_grid(N, Ts)
     _check_positive(amplitude=amplitude)
     _check_band(band, Ts)
     _check_positive(band=band[0])
@@ -215,7 +215,7 @@ def pulse(N: int, Ts: float, *, amplitude: float = 1.0, width: float = 0.5, dela
     >>> pulse(5, 0.1, amplitude=3.0, width=0.2, delay=0.1)
     array([0., 3., 3., 0., 0.])
     """
-    _check_grid(N, Ts)
+    N, Ts = _checked_grid(N, Ts)
     _check_positive(width=width)
     number(amplitude, "amplitude", unit="V", example="3.0")
     number(delay, "delay", least=0, unit="s", example="0.1")
@@ -236,13 +236,15 @@ INPUTS: dict[str, Callable[..., Voltage]] = {
 """Name -> function of each kind of input."""
 
 
-def _check_grid(N: int, Ts: float) -> None:
+def _checked_grid(N: int, Ts: float) -> tuple[int, float]:
+    """Number of samples, which may be given as a float such as 2 / 0.002, and sampling period."""
     count, period = real(N), real(Ts)
     if not (1 <= count <= LARGEST_COUNT and count == int(count) and SMALLEST <= period <= LARGEST):
         raise InputError(
             "Arguments `N` and `Ts` must be a number of samples and a sampling period in seconds, "
             f"but are {shown(N)} and {shown(Ts)}; give for instance 5000 and 0.002."
         )
+    return int(count), period
 
 
 def _check_positive(**values: float) -> None:
