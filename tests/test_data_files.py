@@ -281,3 +281,20 @@ def test_what_is_saved_is_loaded_again_bit_by_bit(tmp_path: Path) -> None:
     assert list(again.signals) == list(named)
     for name, values in named.items():
         np.testing.assert_array_equal(again.signals[name], values)
+
+
+def test_what_is_saved_in_other_units_keeps_them(tmp_path: Path) -> None:
+    moved = Recording(u=U, y=np.rad2deg(Y), Ts=Ts, units=("deg", "deg"), input_name="goal", input_unit="rad")
+    path = save_csv(moved, tmp_path / "run.csv")
+    assert path.read_text().startswith("t,goal [rad],theta [deg],alpha [deg]\n")
+    again = load(path, input="goal")
+    assert (again.input_name, again.input_unit, again.units) == ("goal", "rad", ("rad", "rad"))
+    np.testing.assert_allclose(again.y, Y, rtol=1e-14)
+
+
+def test_unit_of_nothing_in_the_recording_is_refused(tmp_path: Path) -> None:
+    path = write_text(tmp_path / "run.csv")
+    assert load(path, units={"theta": "rad", "voltage": "V"}).units == ("rad", "rad")
+    phrase = "names 'thet', but the channels are theta, alpha and the input is 'voltage'; name one of these"
+    with pytest.raises(InputError, match=phrase):
+        load(path, units={"thet": "deg"})

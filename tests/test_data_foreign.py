@@ -47,6 +47,28 @@ def test_any_object_with_input_and_outputs():
         rf.load(run(y=np.full(300, np.nan)))
 
 
+@pytest.mark.parametrize(
+    "option",
+    [
+        {"degrees": True},
+        {"counts": 4096},
+        {"input": "volts"},
+        {"time": "t"},
+        {"time_unit": "ms"},
+        {"resample": 0.02},
+        {"arm_absolute": True},
+    ],
+)
+def test_options_on_columns_are_refused(option):
+    with pytest.raises(InputError, match=f"`{next(iter(option))}` says how to read a file or a table"):
+        rf.load(run(), outputs="theta", units={"theta": "rad"}, **option)
+
+
+def test_unit_of_no_channel_is_refused():
+    with pytest.raises(InputError, match="train: argument `units` names 'thet', but the channels are theta"):
+        rf.load(run(), outputs="theta", units={"thet": "rad"})
+
+
 def test_a_table_is_no_foreign_recording():
     pd = pytest.importorskip("pandas")
     frame = pd.DataFrame({"t": K / 100, "u": np.sin(K), "y": np.cos(0.1 * K)})

@@ -137,11 +137,12 @@ class Columns:
 
     def reading(self) -> dict[str, Any]:
         """The options as arguments of `rotflex_jax.load`."""
+        from rotflex_jax.data.columns import named_outputs
         from rotflex_jax.mechanism.linear import units_to_read
 
         units = {} if self.mechanism is None else units_to_read(self.mechanism)
         channels, told = _channels(self.outputs or (), self.mechanism.channels if self.mechanism else ())
-        units |= told
+        units = {c: unit for c, unit in units.items() if c in named_outputs(channels)} | told
         # Without --input the column of the voltage is read, which is not the input of such a model.
         if self.input is not None and self.mechanism is not None and self.mechanism.units.input != "V":
             units |= {self.input: self.mechanism.units.input}

@@ -306,6 +306,13 @@ def load(
                 "Argument `signals` must name columns of a file or a table, but an object with `u` and `y` "
                 "was given; leave it out, and give the samples to with_signals() of what is loaded."
             )
+        choices = {"input": input, "degrees": degrees or None, "time": time, "counts": counts}
+        choices |= {"arm_absolute": arm_absolute or None, "time_unit": time_unit, "resample": resample}
+        if said := next((name for name, value in choices.items() if value is not None), None):
+            raise InputError(
+                f"Argument `{said}` says how to read a file or a table, but an object with `u` and `y` was "
+                "given, which is taken unchanged; leave it out, and convert the object before."
+            )
         names = list(outputs) if isinstance(outputs, Mapping) else outputs
         return from_foreign(source, names, units, Ts, accepted)
     table = read_table(source, sys.maxsize if "huge" in accepted else max_bytes, time)
@@ -318,6 +325,13 @@ def load(
         raise InputError(
             f"{table.label}: the column {u_name!r} was given as input and as output, but it can be "
             "only one; correct input= or outputs=."
+        )
+    given_as = "voltage" if input is None else input
+    strange = [name for name in units or {} if name not in (*chosen, u_name, given_as)]
+    if strange:
+        raise InputError(
+            f"Argument `units` names {strange[0]!r}, but the channels are {', '.join(chosen)} and the input "
+            f"is {u_name!r}; name one of these."
         )
     acting = named_signals(signals, table)
     for name in acting.values():
@@ -394,7 +408,7 @@ def load(
         remarks.append(told)
     # A user who gives the unit of the time means a long period; a column of times has been checked above.
     seconds = period >= SLOWEST_SAMPLING and (time_unit is not None or "units" in accepted)
-    driven_in = (units or {}).get(u_name) or (units or {}).get("voltage" if input is None else input)
+    driven_in = (units or {}).get(u_name) or (units or {}).get(given_as)
     other = input_unit(table, u_name, driven_in, "units" in accepted)
     try:
         recording = Recording(
@@ -427,6 +441,8 @@ def load(
 def save_csv(recording: Recording, path: str | os.PathLike[str]) -> Path:
     """Writes a recording as text that `load` reads: time, input, outputs and signals, with their names.
 
+    A unit that `load` does not assume, such as that of a goal or of an angle in degrees, is part of the name.
+
     Args:
         recording: recording to write.
         path: path of the file, which is replaced if it exists.
@@ -441,7 +457,14 @@ def save_csv(recording: Recording, path: str | os.PathLike[str]) -> Path:
     columns = np.column_stack([recording.t, recording.u, recording.y, *recording.signals.values()])
     # 17 digits represent a number exactly; the time is known to fewer digits.
     formats = ["%.15g"] + ["%.17g"] * (columns.shape[1] - 1)
-    header = ["t", recording.input_name, *recording.channels, *recording.signals]
+    outputs = zip(recording.channels, recording.units, strict=True)
+    header = ["t", _titled(recording.input_name, recording.input_unit, "V")]
+    header += [*(_titled(name, unit, "rad") for name, unit in outputs), *recording.signals]
     csv.writer(text := StringIO(), lineterminator="\n").writerow(header)
     np.savetxt(text, columns, fmt=formats, delimiter=",")
     return write_file(path, text.getvalue())
+
+
+def _titled(name: str, unit: str, assumed: str) -> str:
+    """The name of a column, with its unit in brackets if that is not the one which `load` assumes."""
+    return name if unit in ("", assumed) else f"{name} [{unit}]"

@@ -55,7 +55,7 @@ def from_foreign(
         The recording; its `n_init` is that of the object, if the object has one.
 
     Raises:
-        InputError: there is no sampling period, or as in `Recording`.
+        InputError: there is no sampling period, `units` names no channel, or as in `Recording`.
 
     >>> from types import SimpleNamespace
     >>> k = np.arange(100)
@@ -73,6 +73,11 @@ def from_foreign(
     width = 1 if y.ndim < 2 else y.shape[1]
     numbered = ["output"] if width == 1 else [f"output_{k + 1}" for k in range(width)]
     given = numbered if channels is None else [channels] if isinstance(channels, str) else list(channels)
+    if strange := [name for name in units or {} if name not in given]:
+        raise InputError(
+            f"{label}: argument `units` names {strange[0]!r}, but the channels are {', '.join(given)}; name "
+            "one of these."
+        )
     return Recording(
         u=real_numbers(source.u, f"{label}: `u`"),
         y=y,
