@@ -308,6 +308,37 @@ def test_a_recording_gives_voltage_and_start() -> None:
     assert found.output_unit == "rad"
 
 
+def test_constants_of_a_recording_are_those_of_the_model() -> None:
+    m, u = model(), white(8)[:2000]
+    recording = recording_of(u, m)
+    stiff = dataclasses.replace(recording, constants={"joint.spring.stiffness": 5.0})
+    expected = average_kernels(m.with_values({"joint.spring.stiffness": 5.0}), recording, "alpha", MEMORY)
+    np.testing.assert_array_equal(average_kernels(m, stiff, "alpha", MEMORY).h1, expected.h1)
+    whole = effect_kernels(m, stiff, "alpha", MEMORY).whole
+    np.testing.assert_array_equal(whole.h1, expected.h1)
+
+
+def test_recording_in_degrees_or_of_another_period_is_refused() -> None:
+    m, u = model(), white(8)[:2000]
+    recording = recording_of(u, m)
+    turned = dataclasses.replace(recording, y=np.rad2deg(recording.y), units=("deg", "deg"))
+    refused(
+        "in deg, but the output theta of the model is in rad", lambda: average_kernels(m, turned, "alpha", 4)
+    )
+    refused(
+        "sampling period of 0.05 s; leave Ts out", lambda: average_kernels(m, recording, "alpha", 4, Ts=0.1)
+    )
+
+
+def test_mirrored_motion_begins_on_the_other_side() -> None:
+    """A joint with dry friction that a recording catches in motion is as odd as one at rest."""
+    m, u = model(HUB), white(8)[:2000]
+    y = simulate(m.mechanism, u, Ts, x0=[0.0, 0.05, 3.0, -1.0], solver=m.solver)
+    found = average_kernels(m, Recording(u=u, y=y, Ts=Ts), "alpha", MEMORY, mirrored=True)
+    assert np.max(np.abs(found.h1)) > 0.01
+    assert np.max(np.abs(found.h2)) < 1e-15
+
+
 # -- effects -----------------------------------------------------------------------------------------
 
 
@@ -377,6 +408,35 @@ def test_series_is_the_same_about_any_level() -> None:
         for past in (u[t : t - 4 : -1] if t > 3 else u[3::-1] for t in range(3, 50))
     ]
     np.testing.assert_allclose(kernels.response(u)[3:], by_hand, atol=1e-12)
+
+
+def test_standard_error_of_the_constant_about_another_level() -> None:
+    """Independent errors of all entries, drawn and moved one by one."""
+    rng, M, runs = np.random.default_rng(2), 3, 20000
+    first, second = np.array([0.1, 0.2, 0.3]), np.array([[0.3, 0.1, 0.2], [0.1, 0.2, 0.1], [0.2, 0.1, 0.1]])
+    kernels = Kernels(
+        "alpha", Ts, 0.0, np.zeros(M), np.zeros((M, M)), h0_std=0.1, h1_std=first, h2_std=second
+    )
+    drawn = np.triu(rng.normal(size=(runs, M, M)) * second)
+    drawn = drawn + np.swapaxes(np.triu(drawn, 1), 1, 2)
+    h1, h0 = rng.normal(size=(runs, M)) * first, 0.1 * rng.normal(size=runs)
+    levels = [
+        dataclasses.replace(kernels, h0=c, h1=a, h2=b).moved(0.8).h0
+        for c, a, b in zip(h0, h1, drawn, strict=True)
+    ]
+    assert kernels.moved(0.8).h0_std == pytest.approx(np.std(levels), rel=0.03)
+
+
+def test_input_of_a_fit_in_other_forms() -> None:
+    u = white(3)[:500]
+    recording = recording_of(u, model())
+    fit = least_squares(Volterra(Delays(4)), recording, "alpha")
+    expected = identified_kernels(fit, 4, u).covariance
+    for data in (u.tolist(), jnp.asarray(u), recording, [recording], (u,)):
+        np.testing.assert_allclose(identified_kernels(fit, 4, data).covariance, expected, rtol=1e-6)
+    refused("`data` must be real numbers of shape", lambda: identified_kernels(fit, 4, ["run.csv"]))
+    refused("input of 3 samples was given for kernels of 4 lags", lambda: identified_kernels(fit, 4, u[:3]))
+    refused("sampling period", lambda: identified_kernels(fit, 4, recording.decimate(2)))
 
 
 def test_sizes_are_standard_deviations_under_a_gaussian_input() -> None:

@@ -16,7 +16,9 @@ from rotflex_jax.kernels.sensitivities import Modelled, OutputModel, lags_of, ou
 from rotflex_jax.mechanism.assembly import rest_state
 from rotflex_jax.mechanism.initial_state import initial_states
 from rotflex_jax.mechanism.mechanism import Mechanism
+from rotflex_jax.models.model import Model
 from rotflex_jax.recording import Recording
+from rotflex_jax.recording.samples import of_one_period
 from rotflex_jax.runtime.xla import double_precision
 from rotflex_jax.text.numbers import json_number
 
@@ -65,14 +67,18 @@ class AveragingRun(NamedTuple):
         """A run from arguments, which are checked; the first state is estimated if `data` is a recording."""
         reach, blocks = 2 * memory if reach is None else whole(reach, "reach", 1), whole(blocks, "blocks", 2)
         x0 = rest_state(s.mechanism.structure, np.float64)
-        channel = s.mechanism.channels[s.output]
         unit, skip = (s.mechanism.units.input, s.unit), reach
         if isinstance(data, Recording):
+            if Ts is not None and not of_one_period([positive(Ts, "Ts", "s", "0.002"), data.Ts]):
+                raise InputError(
+                    f"Argument `Ts` was given as {Ts:g}, but the recording has a sampling period of "
+                    f"{data.Ts:g} s; leave Ts out."
+                )
             m, Ts, u = data.n_init, data.Ts, data.u.astype(float)
-            unit = (data.input_unit, dict(zip(data.channels, data.units, strict=True)).get(channel, s.unit))
+            unit = (data.input_unit, s.unit)
             skip = max(reach, m)
             if set(s.mechanism.channels) <= set(data.channels):
-                y = np.stack([data.channel(c) for c in s.mechanism.channels], axis=1).astype(float)
+                y = Model(s.mechanism, s.solver).measured(data).astype(float)
                 start = initial_states(s.mechanism, s.solver, s.gates, u[None, :m], y[None, :m], Ts)[0]
                 x0[: len(start)] = start
         else:
@@ -124,15 +130,17 @@ def average_kernels(
 
     Args:
         model: Mechanism, or a model with its own integration rule and gates.
-        data: Recording, which gives voltage and first state, or a voltage [V] that starts from rest.
+        data: Recording, which gives voltage, first state and its constants, or a voltage [V] that starts
+            from rest.
         channel: Output.
         memory: Number of lags M, from 0 to M - 1.
         Ts: Sampling period [s], if `data` is a voltage.
         reach: Number of lags L >= M of the output derivatives, which should decay within them unless the
             input is white. Twice the memory if None.
         blocks: Number of blocks of the recording, whose scatter gives the standard errors.
-        mirrored: Whether to average over the voltage and the voltage with opposite sign, which are equally
-            likely if the mean is zero. The quadratic kernel of an odd mechanism is then exactly zero.
+        mirrored: Whether to average over the voltage and the voltage with opposite sign, from the opposite
+            first state, which are equally likely if the mean is zero. The quadratic kernel of an odd
+            mechanism is then exactly zero.
         autocovariance: Autocovariance of the input at lags 0 to L - 1 [V^2], if it is known; None for the
             sample autocovariance, as in a least-squares fit of the same recording.
 
@@ -146,9 +154,16 @@ def average_kernels(
     Source: Stein, Ann. Stat. 9, 1981, lemma 2; Price, IRE Trans. Inf. Theory 4, 1958; Schetzen, The
     Volterra and Wiener Theories of Nonlinear Systems, 1980.
     """
-    s, memory = output_model(model, channel), lags_of(memory)
+    s, memory = _of_recording(output_model(model, channel), data), lags_of(memory)
     run = AveragingRun.of(s, data, Ts, memory, reach, blocks, mirrored)
     return kernels_of(run, block_kernels(s, run, autocovariance), channel)
+
+
+def _of_recording(s: OutputModel, data: Any) -> OutputModel:
+    """The model with the constants of a recording, if that is what was given."""
+    if not isinstance(data, Recording):
+        return s
+    return s._replace(mechanism=Model(s.mechanism, s.solver).at(data).mechanism)
 
 
 class BlockKernels(NamedTuple):
@@ -180,7 +195,9 @@ def block_kernels(
     P = np.linalg.solve(R, whole[:M])
     found = [_blocks(s, run, run.u, lagged, P, R)]
     if run.mirrored:
-        found.append(_blocks(s, run, -run.u, -lagged, P, R))
+        start, moving = run.x0.copy(), 2 * len(s.mechanism.coordinates)
+        start[:moving] *= -1
+        found.append(_blocks(s, run._replace(x0=start), -run.u, -lagged, P, R))
     h0, h1, h2 = (np.mean([f[k] for f in found], axis=0) for k in range(3))
     return BlockKernels(h0, h1, h2, R)
 
@@ -357,7 +374,7 @@ def effect_kernels(
     Raises:
         InputError: As `average_kernels`.
     """
-    s, memory = output_model(model, channel), lags_of(memory)
+    s, memory = _of_recording(output_model(model, channel), data), lags_of(memory)
     run = AveragingRun.of(s, data, Ts, memory, reach, blocks, mirrored)
     all_on = block_kernels(s, run, autocovariance)
     whole = kernels_of(run, all_on, channel)

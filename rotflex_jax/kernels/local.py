@@ -6,9 +6,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Real
+from jax.typing import ArrayLike
+from jaxtyping import Float, Real
 
-from rotflex_jax.checks import LARGEST_COUNT, number, positive
+from rotflex_jax.checks import LARGEST_COUNT, number, positive, signal
 from rotflex_jax.errors import InputError
 from rotflex_jax.kernels.result import Kernels
 from rotflex_jax.kernels.sensitivities import Modelled, lags_of, output_model
@@ -17,6 +18,7 @@ from rotflex_jax.mechanism.mechanism import Mechanism
 from rotflex_jax.mechanism.scan import states
 from rotflex_jax.mechanism.simulate import FreeStep, Solver, free_run, read_outputs
 from rotflex_jax.recording import Recording
+from rotflex_jax.recording.samples import require_period
 from rotflex_jax.runtime.persistent_jit import persistent_jit
 from rotflex_jax.runtime.xla import double_precision
 
@@ -146,7 +148,7 @@ def _derivatives(
 def identified_kernels(
     identified: Any,  # a SeriesFit or a Series, of the layers above
     memory: int,
-    data: Recording | Sequence[Recording] | Real[np.ndarray, " N"] | None = None,
+    data: Recording | Sequence[Any] | Real[ArrayLike, " N"] | None = None,
     *,
     about: float = 0.0,
 ) -> Kernels:
@@ -165,7 +167,8 @@ def identified_kernels(
         about: Level that was subtracted from the input before the fit [V].
 
     Raises:
-        InputError: The basis has a degree above three, or a cubic degree without `data`.
+        InputError: The basis has a degree above three, or a cubic degree without `data`; `data` has another
+            sampling period than the series, or fewer samples than there are lags.
 
     >>> from types import SimpleNamespace
     >>> from rotflex_jax.basis import Delays, Volterra
@@ -177,7 +180,7 @@ def identified_kernels(
     """
     memory, series = lags_of(memory), getattr(identified, "model", identified)
     covariance = getattr(identified, "covariance", None)
-    spread, words = _input(data, memory, about, series.input_unit)
+    spread, words = _input(data, memory, about, series)
 
     def orders(w: np.ndarray) -> list[np.ndarray]:
         """Kernels of degree 0 to 2 from weights, or from a change of the weights."""
@@ -220,13 +223,23 @@ def identified_kernels(
 
 
 def _input(
-    data: Recording | Sequence[Recording] | np.ndarray | None, memory: int, about: float, unit: str
-) -> tuple[np.ndarray | None, str]:
+    data: Any, memory: int, about: float, series: Any
+) -> tuple[Float[np.ndarray, "memory memory"] | None, str]:
     """Covariance of the input at the lags, and a description of the input."""
     if data is None:
         return None, ""
-    listed = [data] if isinstance(data, (Recording, np.ndarray)) else list(data)
-    runs = [np.asarray(d.u if isinstance(d, Recording) else d, float) - about for d in listed]
+    several = isinstance(data, list | tuple) and any(isinstance(d, Recording) or np.ndim(d) for d in data)
+    runs = []
+    for d in data if several else [data]:
+        if isinstance(d, Recording):
+            require_period(series.Ts, d.Ts, "The series holds")
+        runs.append(signal(d.u if isinstance(d, Recording) else d, "data").astype(float) - about)
+    if (shortest := min(map(len, runs))) < memory:
+        raise InputError(
+            f"An input of {shortest} samples was given for kernels of {memory} lags, but it needs one sample "
+            "for each lag; give a longer one, or fewer lags."
+        )
     phi = np.concatenate([np.lib.stride_tricks.sliding_window_view(v, memory)[:, ::-1] for v in runs])
     v = np.concatenate(runs)
-    return phi.T @ phi / len(phi), f"{len(v)} samples, {np.sqrt(np.mean(v**2)):.3g} {unit} rms"
+    words = f"{len(v)} samples, {np.sqrt(np.mean(v**2)):.3g} {series.input_unit} rms"
+    return phi.T @ phi / len(phi), words

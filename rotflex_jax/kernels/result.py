@@ -88,18 +88,21 @@ class Kernels:
         return self.output_unit + power[degree]
 
     def moved(self, about: float) -> "Kernels":
-        """The same series about another input level; standard errors to first order.
+        """The same series about another input level; standard errors to first order, without correlations.
 
         Args:
             about: New level [input_unit].
         """
         step = about - self.about
         first, second = self.errors
+        twice = 2 * second - np.diag(np.diag(second))  # of the two equal entries off the diagonal together
+        changes = (self.h0_std, *(step * first), *(step**2 * twice[np.triu_indices_from(twice)]))
         return dataclasses.replace(
             self,
             h0=float(self.h0 + step * np.sum(self.h1) + step**2 * np.sum(self.h2)),
             h1=self.h1 + 2 * step * np.sum(self.h2, axis=1),
             about=about,
+            h0_std=float(np.linalg.norm(changes)),
             h1_std=np.hypot(first, 2 * step * np.sqrt(np.sum(second**2, axis=1))),
         )
 
