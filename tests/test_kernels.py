@@ -515,6 +515,8 @@ def test_bad_input_is_refused_in_one_sentence() -> None:
     wild: Mechanism = joint + fx.QuadraticSpring("joint", stiffness=30.0)
     refused("does not stay finite", lambda: average_kernels(wild, u, "alpha", 4, Ts=Ts))
     refused("same channel", lambda: some().against(local_kernels(joint, Ts, "theta", 4)))
+    turned = dataclasses.replace(some(), output_unit="deg")
+    refused("in rad/V were compared with kernels in deg/V", lambda: some().against(turned))
 
     for order, words in ((3, "degree 3 was given without data"), (4, "degree 4 was given, but")):
         basis = Volterra(Delays(2), order)

@@ -11,12 +11,13 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import minimize
 
 from rotflex_jax.arena.simulator.records import make_record
+from rotflex_jax.data import excitation
 from rotflex_jax.discover.explanation import calibrated, with_effects_of
 from rotflex_jax.discover.result import Stage
 from rotflex_jax.effects import Coulomb, CubicSpring, Gravity, SensorBias
 from rotflex_jax.errors import InputError
 from rotflex_jax.fit.dataset import StackedRecordings, sensor_noise
-from rotflex_jax.joints import paper, single_inertia
+from rotflex_jax.joints import emps, paper, single_inertia
 from rotflex_jax.latent import latent_torque, smoother
 from rotflex_jax.latent.figure import latent_maps, latent_time
 from rotflex_jax.latent.result import binned_mean
@@ -30,7 +31,7 @@ from rotflex_jax.latent.smoother import (
     linearise_along,
     log_likelihood,
 )
-from rotflex_jax.mechanism import linearise, simulate_states
+from rotflex_jax.mechanism import linearise, simulate, simulate_states
 from rotflex_jax.models.model import Model
 from rotflex_jax.parameters import Estimate
 from rotflex_jax.recording import Recording
@@ -320,6 +321,16 @@ def test_offsets_of_a_recording_are_part_of_the_stage():
     assert isinstance(bias, SensorBias) and bias.bias == 0.01
 
 
+def test_curves_have_the_units_of_the_machine():
+    axis = emps()
+    u = excitation.noise(600, 0.004, seed=1)
+    y = simulate(axis + Coulomb("axis", level=10.0), u, 0.004)
+    recording = Recording(u=u, y=y, Ts=0.004, channels="position", units="m", accept=("units",))
+    found = latent_torque(axis, recording)
+    assert [found.curve("axis", x).unit for x in ("position", "speed", "voltage")] == ["m", "m/s", "V"]
+    assert latent_maps(found).axes[2].get_xlabel() == "position of the axis [mm]"
+
+
 def test_bad_input_is_named():
     r, _ = recorded(seconds=2.0)
     with pytest.raises(InputError, match="'wrist' was asked for"):
@@ -336,5 +347,8 @@ def test_bad_input_is_named():
     bare = dataclasses.replace(found, linear={})
     with pytest.raises(InputError, match="no port of the torques has a spring"):
         bare.curve("hub", "deflection")
+    for bins in (0, -1, 2.5):
+        with pytest.raises(InputError, match="`bins` must be a whole number from 1"):
+            found.curve("hub", bins=bins)
     assert "hub" in str(found) and "nat" in str(found)
     assert sensor_noise([r], Model(paper()))[0] > 0

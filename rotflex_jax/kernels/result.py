@@ -120,12 +120,19 @@ class Kernels:
         """Difference from other kernels in units of their standard errors.
 
         Args:
-            other: Kernels of the same channel, sampling period and memory; they are converted to this input
-                level.
+            other: Kernels of the same channel, units, sampling period and memory; they are converted to this
+                input level.
 
         Raises:
-            InputError: Channel, sampling period or memory differ.
+            InputError: Channel, sampling period, memory or units differ.
         """
+        units = [(self.output_unit, other.output_unit), (self.input_unit, other.input_unit)]
+        for one, two in units:
+            if one and two and one != two:
+                raise InputError(
+                    f"Kernels of {self.channel!r} in {self.units(1)} were compared with kernels in "
+                    f"{other.units(1)}; form both in the same units."
+                )
         mine, theirs = (self.channel, self.memory), (other.channel, other.memory)
         if mine != theirs or abs(self.Ts - other.Ts) > 1e-9 * self.Ts:
             raise InputError(

@@ -8,6 +8,7 @@ import numpy as np
 import scipy
 from jaxtyping import Bool, Float, Int
 
+from rotflex_jax.checks import whole
 from rotflex_jax.effects.base import Linear
 from rotflex_jax.errors import InputError
 from rotflex_jax.latent.in_time import Drift, PeriodicTorque, drift, periodic_torques
@@ -194,7 +195,11 @@ class LatentTorque:
             port: Port of the torque.
             against: Speed or position of the port, deflection of the joint's spring, voltage or time.
             bins: Number of bins.
+
+        Raises:
+            InputError: There is no such port, abscissa or number of bins.
         """
+        bins = whole(bins, "bins", 1)
         i, (x, name, unit) = self._index(port), self.axis(port, against)
         fields = binned_mean(x, self.torque[:, i], self.std[:, i], bins, self.recording)
         return TorqueCurve(**fields, against=name, unit=unit, port=port)
@@ -216,7 +221,7 @@ class LatentTorque:
             "position": (
                 self.position[:, i],
                 f"{'deflection' if sprung else 'position'} of the {port}",
-                "rad",
+                self.motion,
             ),
             "voltage": (self.voltage, "voltage" if self.input == "V" else "input", self.input),
             "time": (self.time, "time", "s"),
