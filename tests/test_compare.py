@@ -351,6 +351,16 @@ def test_several_recordings_and_files_of_their_own_to_judge_on() -> None:
     assert list(split["arx"].rmse.values()) == pytest.approx(np.sqrt(np.mean(np.square(both), axis=0)))
 
 
+def test_a_recording_in_degrees_is_refused_before_any_method_learns() -> None:
+    recording, learned = recorded(), []
+    turned = dataclasses.replace(
+        recording, y=np.rad2deg(recording.y), units=("deg", "deg"), accept=("units",)
+    )
+    with pytest.raises(rf.InputError, match="in deg, but the output theta of the model is in rad"):
+        rf.compare(turned, [Told("level", level, learned.append)])
+    assert not learned
+
+
 @pytest.mark.parametrize(
     ("methods", "given", "phrase"),
     [

@@ -83,6 +83,28 @@ def test_error_grows_with_the_horizon_as_it_was_made_to(table: Comparison) -> No
     assert told.runs == len(horizon_segments([test], table.window_seconds)) > 3
 
 
+def test_horizons_of_recordings_of_several_sampling_periods() -> None:
+    """The drift of 1 rad/s, of which each recording shows the part within the interval."""
+    fine, coarse = recorded(), recorded(2400, seed=1).decimate(2)
+    fitted = Drifts("fast", 1.0).fit(Model(rf.joints.paper()), [fine], print)
+
+    def expected(Ts: float, ends: np.ndarray) -> np.ndarray:
+        counts = np.round(ends / Ts).astype(int)
+        starts = np.concatenate([[0], counts[:-1]])
+        return np.array(
+            [np.mean((Ts * np.arange(a + 1, b + 1)) ** 2) for a, b in zip(starts, counts, strict=True)]
+        )
+
+    for order in ((fine, coarse), (coarse, fine)):
+        told = errors_by_horizon(fitted.simulator, order, 2.0)
+        assert told.seconds[-1] == pytest.approx(2.0)
+        ends = np.array(told.seconds)
+        parts = horizon_segments(order, 2.0)
+        share = np.mean([r.Ts == 0.01 for r in parts])
+        squares = share * expected(0.01, ends) + (1 - share) * expected(0.02, ends)
+        np.testing.assert_allclose(told.rmse["theta"], np.sqrt(squares), atol=5e-3)
+
+
 def test_a_free_run_cannot_look_ahead_at_any_horizon() -> None:
     test = recorded()
     cheat = SimpleNamespace(simulate=lambda r: r.y)

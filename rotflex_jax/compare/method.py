@@ -305,7 +305,7 @@ def errors_by_horizon(simulator: Simulator, recordings: Sequence[Recording], sec
 
     Args:
         simulator: The model to evaluate.
-        recordings: Test recordings of one sampling period.
+        recordings: Test recordings; an interval has at least one sample of each sampling period.
         seconds: Horizon [s].
     """
     if isinstance(simulator, Model):
@@ -313,17 +313,19 @@ def errors_by_horizon(simulator: Simulator, recordings: Sequence[Recording], sec
         simulator, recordings = pairs[0][0], [r for _, r in pairs]
     parts = horizon_segments(recordings, seconds)
     runs = free_runs(simulator, parts)
-    ahead = min(r.N - r.n_init for r in parts)
+    longest = max(r.Ts for r in recordings)
+    ahead = max(1, int(min((r.N - r.n_init) * r.Ts for r in parts) / longest + 1e-6))
     edges = np.unique(np.round(np.geomspace(1, ahead, HORIZON_POINTS)).astype(int))
+    squares = []
     with np.errstate(all="ignore"):
-        e = np.stack([(r.y - y_hat)[r.n_init :][:ahead] for r, y_hat in zip(parts, runs, strict=True)])
-        squares = np.mean(e**2, axis=0)  # (ahead, C)
-        ends = np.concatenate([[0], edges])
-        rms = [np.sqrt(squares[a:b].mean(axis=0)) for a, b in itertools.pairwise(ends)]
-    by_channel = np.array(rms).T
+        for r, y_hat in zip(parts, runs, strict=True):
+            e = (r.y - y_hat)[r.n_init :]
+            ends = [0, *np.floor(edges * longest / r.Ts + 1e-6).astype(int).tolist()]
+            squares.append([np.mean(e[a:b] ** 2, axis=0) for a, b in itertools.pairwise(ends)])
+        rms = np.sqrt(np.mean(squares, axis=0))  # (intervals, C)
     return Horizon(
-        tuple((edges * recordings[0].Ts).tolist()),
-        {c: tuple(v.tolist()) for c, v in zip(recordings[0].channels, by_channel, strict=True)},
+        tuple((edges * longest).tolist()),
+        {c: tuple(v.tolist()) for c, v in zip(recordings[0].channels, rms.T, strict=True)},
         len(parts),
     )
 

@@ -156,10 +156,9 @@ def _training_and_test(
 
 def _with_model_channels(recording: Recording, model: Model) -> Recording:
     """The recording with only the channels of the model, in its order: the same for every method."""
-    wanted = model.mechanism.channels
+    wanted, y = model.mechanism.channels, model.measured(recording)
     if recording.channels == wanted:
         return recording
-    y = model.measured(recording)
     return dataclasses.replace(
         recording,
         y=y,

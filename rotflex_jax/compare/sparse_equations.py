@@ -105,7 +105,11 @@ class SparseEquations:
         t = np.arange(-k + 1, 1) * self.Ts
         slope = np.linalg.pinv(np.vander(t, 3))[1]
         v = np.stack([np.convolve(c, slope[::-1])[: len(y)] for c in y.T], axis=1)
-        v[: k - 1] = v[k - 1]
+        # Before there are enough samples, of those that there are; one sample alone shows no speed.
+        for i in range(min(k - 1, len(y))):
+            degree = min(i, 2)
+            rows = np.vander(t[k - 1 - i :], degree + 1)
+            v[i] = np.linalg.lstsq(rows, y[: i + 1], rcond=None)[0][-2] if degree else 0.0
         x = np.concatenate([y, v], axis=1) if self.terms.order == 2 else y
         u = recording.u.astype(float)
         pairs = np.stack([u, np.concatenate([u[1:], u[-1:]])], axis=1)
