@@ -1,6 +1,7 @@
 """Evidence of an input against least squares, scipy, finite differences and an independent simulator."""
 
 import dataclasses
+import re
 
 import jax.numpy as jnp
 import numpy as np
@@ -260,6 +261,22 @@ def test_the_file_can_be_played_and_read_back(experiment, tmp_path):
     assert back.Ts == pytest.approx(0.005)
     with pytest.raises(InputError, match="folder"):
         experiment.save_csv(tmp_path / "none" / "next.csv")
+
+
+def test_a_machine_in_metres_is_told_in_metres():
+    axis, limits = rf.joints.emps(), Limits(voltage=2.0)
+    e = rf.next_experiment(
+        axis,
+        "coulomb@axis",
+        "quadratic_drag@axis",
+        limits=limits,
+        seconds=2.0,
+        Ts=0.01,
+        noise={"position": 1e-5},
+        improve=False,
+    )
+    assert re.search(r"slew to [\d.]+ V/s, position to [\d.]+ m predicted", str(e))
+    assert "position [mm]" in {ax.get_ylabel() for ax in e.plot().axes}
 
 
 def test_the_figure_names_units_and_both_effects(experiment):

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from rotflex_jax.experiment import common_structure, rival_set
 from rotflex_jax.experiment.rival_set import CALIBRATION_SPREAD, STATE_SPREAD, RunData
 from rotflex_jax.experiment.segment_choice import SegmentChoice
 from rotflex_jax.experiment.sequential import SequentialExperiment, sequential_experiment
+from rotflex_jax.models.model import Model
 
 TS, NOISE = 0.01, {"theta": 2e-3}
 LIMITS = rf.Limits(voltage=2.0, travel=1.5)
@@ -329,6 +331,54 @@ def test_on_the_independent_simulator_the_true_effect_is_found_within_the_limits
     assert np.max(np.abs(played)) <= 6.0
     assert np.max(np.abs(found.runs[0].y), axis=0) == pytest.approx(0, abs=np.deg2rad(90))
     assert np.max(np.abs(found.runs[0].y[:, 1])) <= np.deg2rad(10)
+
+
+def test_a_simulated_rig_has_the_effects_and_the_noise_that_are_asked_for():
+    joint, u = rf.joints.paper(), np.sin(0.3 * np.arange(100))
+    gated = Model(joint + rf.effects.Coulomb("hub", level=0.05), gates=(*[1.0] * len(joint.effects), 0.0))
+    expected = rf.SimulatedRig(joint, LIMITS, 0.01).play(u)
+    np.testing.assert_array_equal(rf.SimulatedRig(gated, LIMITS, 0.01).play(u), expected)
+    for noise, words in (({"tetha": 1e-3}, "names 'tetha'"), (1e-3, "is 0.001")):
+        with pytest.raises(InputError, match=f"by the channels theta, alpha, but {words};"):
+            rf.SimulatedRig(joint, LIMITS, 0.01, noise=noise)
+    with pytest.raises(InputError, match=r"1, 0\.5, but only effects that are on or off"):
+        rf.SimulatedRig(dataclasses.replace(gated, gates=(*gated.gates[:-1], 0.5)), LIMITS, 0.01)
+
+
+def test_arguments_of_the_other_use_are_refused():
+    joint, noise = rf.joints.paper(), {"theta": 1e-3, "alpha": 1e-3}
+    with pytest.raises(InputError, match="`probabilities` is for several models"):
+        rf.next_experiment(
+            joint, "coulomb@hub", "delay@input", limits=LIMITS, noise=noise, probabilities=[0.5, 0.5]
+        )
+    models = [joint, joint + rf.effects.Coulomb("hub", level=0.05)]
+    with pytest.raises(InputError, match="`reference` is for two effects of one model"):
+        rf.next_experiment(models, limits=LIMITS, noise=noise, reference=np.ones(500))
+
+
+def test_a_machine_in_metres_is_told_in_metres(tmp_path):
+    axis, limits, noise = rf.joints.emps(), rf.Limits(voltage=2.0), {"position": 1e-5}
+    rough = axis + rf.effects.Coulomb("axis", level=20.0)
+    rig = rf.SimulatedRig(rough, limits, 0.01, noise=noise)
+    models = {"smooth": axis, "rough": rough}
+    found = rf.experiment_until(models, rig, max_seconds=1.0, noise=noise, improve=False)
+    assert (found.best, found.runs[0].units, found.runs[0].input_unit) == ("rough", ("m",), "V")
+    assert [ax.get_ylabel() for ax in found.plot().axes][1:] == ["voltage [V]", "position [mm]"]
+    s = rf.next_experiment(models, limits=limits, seconds=2.0, Ts=0.01, noise=noise, improve=False)
+    assert re.search(r"voltage to [\d.]+ V, position to [\d.]+ m predicted", str(s))
+    assert [ax.get_ylabel() for ax in s.plot().axes] == ["voltage [V]", "position [mm]"]
+    e = sequential_experiment(models, limits, 0.01, noise=noise, improve=False).with_next_segment()
+    assert SequentialExperiment.load(e.save(tmp_path / "state.json")).planned.units == ("m",)
+
+
+def test_a_goal_is_told_in_its_unit(tmp_path):
+    servo, limits, noise = rf.joints.sts3215(), rf.Limits(voltage=0.5), {"theta": 1e-3}
+    models = {"smooth": servo, "rough": servo + rf.effects.Coulomb("hub", level=0.05)}
+    s = rf.next_experiment(models, limits=limits, seconds=4.0, Ts=0.02, noise=noise, improve=False)
+    assert re.search(r"input to [\d.]+ rad, theta to [\d.]+ rad predicted", str(s))
+    head, names, *_ = s.save_csv(tmp_path / "next.csv").read_text().splitlines()
+    assert head.startswith("# t in s, input in rad,") and names == "t,input [rad]"
+    assert s.plot().axes[0].get_ylabel() == "input [rad]"
 
 
 def test_several_models_have_one_next_experiment(tmp_path):

@@ -33,7 +33,7 @@ PACKAGE = Path(rf.__file__).parent
 K = np.arange(60.0)
 RUN = rf.Recording(u=np.sin(K), y=np.cos(K / 3), Ts=0.1)
 ROW = RecordingRow("run", "run.csv", reason="none")
-INPUT: Any = SimpleNamespace(t=K, u=K, Ts=0.1, separates=("a", "b"))
+INPUT: Any = SimpleNamespace(t=K, u=K, Ts=0.1, separates=("a", "b"), input_unit="V")
 
 # Functions that write a file into a folder, and the name of the file.
 WRITERS: dict[str, tuple[Callable[[Path], object], str]] = {

@@ -14,7 +14,7 @@ from rotflex_jax.cli.recordings import Columns, reads_files
 from rotflex_jax.errors import InputError
 from rotflex_jax.joints import by_name
 from rotflex_jax.text.files import write_file
-from rotflex_jax.text.numbers import digits
+from rotflex_jax.text.numbers import digits, readable
 
 # Options of the first command of an experiment; later commands take them from its state.
 FIRST_COMMAND = (
@@ -165,7 +165,7 @@ def experiment(
         _write_files(found, save, plot)
         return
     terminal.output().print(str(found), markup=False)
-    names = found.channels
+    outputs = dict(zip(found.channels, found.units, strict=True))
     rows = [
         (
             f"{r.input}, {r.setting}",
@@ -173,11 +173,18 @@ def experiment(
             digits(r.nats / seconds),
             digits(r.voltage),
             digits(r.slew),
-            *(digits(math.degrees(r.peaks[n])) for n in names),
+            *(digits(readable(r.peaks[n], unit)[0]) for n, unit in outputs.items()),
         )
         for r in found.table
     ]
-    heads = ("input", "nats", "nats/s", "V", "V/s", *(f"{n} [deg]" for n in names))
+    driven = (found.input_unit, f"{found.input_unit}/s")
+    heads = (
+        "input",
+        "nats",
+        "nats/s",
+        *driven,
+        *(f"{n} [{readable(0.0, u)[1]}]" for n, u in outputs.items()),
+    )
     terminal.print_rows(heads, rows)
     if json_file is not None:
         write_file(json_file, json.dumps(result, indent=2) + "\n")

@@ -54,7 +54,7 @@ def rival_set(
     models = [g.model if isinstance(g, Fit) else Model.of(g) for _, g in items]
     for m in models:
         check_input_alone(m.mechanism, "a designed experiment")
-    reduced = [_without_gates(m) for m in models]
+    reduced = [m.without_gates() for m in models]
     labels = _labels([name for name, _ in items], reduced)
     first = reduced[0].mechanism
     for label, m in zip(labels, reduced, strict=True):
@@ -155,16 +155,6 @@ def _items(given: Any) -> list[tuple[str | None, Any]]:
             f"{'one' if good else checks.shown(given)} was given; give a list of them, or name -> model."
         )
     return [(None if n is None else str(n), g) for n, g in pairs]
-
-
-def _without_gates(model: Model) -> Model:
-    """The model without the effects that its gates switch off."""
-    if model.gates is None:
-        return model
-    m = model.mechanism
-    for e, gate in zip(m.effects, model.gates, strict=True):
-        m = m if gate else m.without(e.name, e.at)
-    return dataclasses.replace(model, mechanism=m, gates=None)
 
 
 def _labels(names: list[str | None], models: list[Model]) -> tuple[str, ...]:

@@ -33,6 +33,7 @@ from rotflex_jax.experiment.standard_inputs import REDUCED_AMPLITUDES, Limits, S
 from rotflex_jax.experiment.until_decided import models_of
 from rotflex_jax.fit.result import Fit
 from rotflex_jax.mechanism import Mechanism
+from rotflex_jax.mechanism.linear import output_units
 from rotflex_jax.mechanism.mechanism import check_input_alone, process_noise_of
 from rotflex_jax.models.model import Model
 
@@ -138,13 +139,19 @@ def next_experiment(
         Experiment; for several models a Segment.
 
     Raises:
-        InputError: The effects are unknown or equal, the noise is not given, or the length is not possible.
+        InputError: The effects are unknown or equal, the noise is not given, the length is not possible, or
+            an argument is for the other use.
 
     Source: Atkinson and Fedorov 1975 (T-optimality, Biometrika 62); Pasch-Hausdorff envelopes for the slew.
     """
     say = checks.progress(progress)
     if a is None and b is None and not isinstance(model, Fit | Model | Mechanism):
         sample_counts(seconds, Ts)
+        if reference is not None:
+            raise InputError(
+                "Argument `reference` is for two effects of one model, but several models were given, which "
+                "have their parameters; leave it out."
+            )
         models, found = models_of(model, say)
         several = sequential_experiment(
             models,
@@ -163,7 +170,12 @@ def next_experiment(
             "Two effects must be named where one model is given, such as 'delay@input' and 'lag@input'; or "
             "give several models."
         )
-    fitted = model.model if isinstance(model, Fit) else Model.of(model)
+    if probabilities is not None:
+        raise InputError(
+            "Argument `probabilities` is for several models, but two effects of one model were given; leave "
+            "it out."
+        )
+    fitted = (model.model if isinstance(model, Fit) else Model.of(model)).without_gates()
     check_input_alone(fitted.mechanism, "a designed experiment")
     if not isinstance(limits, Limits):
         raise InputError(
@@ -214,6 +226,8 @@ def next_experiment(
         outputs=result.outputs,
         differences=np.einsum("knc,kdc->knd", whitened, L),
         channels=fitted.mechanism.channels,
+        units=tuple(output_units(fitted.mechanism).values()),
+        input_unit=fitted.mechanism.units.input,
         noise=dict(zip(fitted.mechanism.channels, sd.tolist(), strict=True)),
         limits=limits,
         notes=_notes(model, chosen),

@@ -4,7 +4,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from rotflex_jax.experiment.result import Experiment, Segment, SequentialResult
+from rotflex_jax.experiment.result import Experiment, Segment, SequentialResult, input_word
 from rotflex_jax.text.colours import BASELINE, FAINT, FINAL, FURTHER, INK
 from rotflex_jax.text.plotting import blank, legend_above, plain_ticks, styled, thinned
 
@@ -40,7 +40,7 @@ def _input(ax: Axes, e: Experiment) -> None:
     ax.axhline(-e.limits.voltage, color=BASELINE, lw=1.0, ls="--")
     whole = f", the first {count * e.Ts:g} s" if count < len(e.u) else ""
     ax.set_title(f"{e.chosen.input}, {e.chosen.setting}{whole} (dashed: limit)")
-    ax.set_ylabel("voltage [V]")
+    ax.set_ylabel(f"{input_word(e.input_unit)} [{e.input_unit}]")
     ax.set_xlabel("time [s]")
 
 
@@ -68,7 +68,7 @@ def _difference(ax: Axes, e: Experiment, c: int, channel: str) -> None:
         y = 1e3 * e.differences[k, here, c]
         ax.plot(e.t[here], y, color=colour, lw=1.3, ls=style, label=label)
     ax.set_title(f"difference in {channel}, {DIFFERENCE_SECONDS:g} s of it")
-    ax.set_ylabel(f"{channel} [mrad]")
+    ax.set_ylabel(f"{channel} [m{e.units[c]}]")
 
 
 def _evidence(ax: Axes, e: Experiment, c: int, channel: str) -> None:
@@ -93,13 +93,13 @@ def segment_figure(s: Segment) -> Figure:
     axes = figure.subplots(1 + len(s.channels), 1, sharex=True)
     axes[0].step(s.t, s.u, where="post", color=INK, lw=0.9)
     axes[0].set_title(f"{s.input}, {s.setting}")
-    axes[0].set_ylabel("voltage [V]")
+    axes[0].set_ylabel(f"{input_word(s.input_unit)} [{s.input_unit}]")
     for c, (ax, channel) in enumerate(zip(axes[1:], s.channels, strict=True)):
         mean = s.outputs[:, :, c].mean(axis=0)
         for name, y, colour in zip(s.rivals, s.outputs[:, :, c], _rival_colours(len(s.rivals)), strict=True):
             ax.plot(*thinned(s.t, 1e3 * (y - mean)), color=colour, lw=1.2, label=name)
         ax.set_title(f"{channel}, less the mean of the models")
-        ax.set_ylabel(f"{channel} [mrad]")
+        ax.set_ylabel(f"{channel} [m{s.units[c]}]")
     axes[-1].set_xlabel("time [s]")
     legend_above(figure, axes[1:])
     return figure
@@ -126,7 +126,7 @@ def sequential_figure(r: SequentialResult) -> Figure:
         for ax, y in zip(axes[2:], run.y.T, strict=True):
             ax.plot(*thinned(t, 1e3 * y.astype(float)), color=INK, lw=0.8)
         began += run.N * run.Ts
-    axes[1].set_ylabel("voltage [V]")
+    axes[1].set_ylabel(f"{input_word(r.input_unit)} [{r.input_unit}]")
     units = r.runs[0].units if r.runs else ()
     for ax, channel, unit in zip(axes[2:], channels, units, strict=True):
         ax.set_ylabel(f"{channel} [m{unit}]")

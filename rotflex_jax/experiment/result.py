@@ -17,16 +17,26 @@ from rotflex_jax.text.markup import bullets, card, paragraph, table
 from rotflex_jax.text.numbers import json_numbers, one_line
 
 
+def input_word(unit: str) -> str:
+    """`voltage`, or `input` where it has another unit, such as a goal or a current."""
+    return "voltage" if unit == "V" else "input"
+
+
 def voltage_file(
-    path: str | os.PathLike[str], u: Float[np.ndarray, " N"], Ts: float, purpose: str = ""
+    path: str | os.PathLike[str],
+    u: Float[np.ndarray, " N"],
+    Ts: float,
+    purpose: str = "",
+    unit: str = "V",
 ) -> Path:
-    """Write a voltage to play: a comment with the units, then `t,voltage`.
+    """Write a voltage to play: a comment with the units, then `t,voltage`; another input is `t,input [unit]`.
 
     Args:
         path: Path of the file.
-        u: Voltage [V].
+        u: Voltage [V], or input in the unit `unit`.
         Ts: Sampling period [s].
         purpose: Purpose of the voltage, for the comment.
+        unit: Unit of the input.
 
     Raises:
         InputError: The folder does not exist, or the file cannot be written; an existing file stays as it is.
@@ -37,7 +47,9 @@ def voltage_file(
             f"{path} cannot be written, since it is a folder or in one that does not exist; name a file "
             "in a folder that is there."
         )
-    head = f"# t in s, voltage in V, each held for {Ts:g} s{'; ' * bool(purpose)}{purpose}\nt,voltage"
+    word = input_word(unit)
+    head = f"# t in s, {word} in {unit}, each held for {Ts:g} s{'; ' * bool(purpose)}{purpose}\n"
+    head += f"t,{word}" if unit == "V" else f"t,{word} [{unit}]"
     rows = np.column_stack([Ts * np.arange(len(u)), u])
     form = ["%.15g", "%.17g"]
     np.savetxt(text := io.StringIO(), rows, fmt=form, delimiter=",", header=head, comments="")
@@ -49,6 +61,12 @@ def json_limits(limits: Limits) -> dict[str, float | None]:
     return json_numbers(dataclasses.asdict(limits))
 
 
+def _predicted(peaks: dict[str, float], units: tuple[str, ...]) -> str:
+    """Largest predicted outputs, in words."""
+    listed = zip(peaks.items(), units, strict=True)
+    return ", ".join(f"{name} to {value:.3g} {unit}".rstrip() for (name, value), unit in listed)
+
+
 @dataclasses.dataclass(frozen=True)
 class Rated:
     """One input and its expected evidence.
@@ -58,9 +76,9 @@ class Rated:
         setting: Parameters of the input in words.
         nats: Log-likelihood by which the true model is expected to win, whichever it is [nat].
         each: This log-likelihood if the first model is true, and if the second model is true [nat].
-        voltage: Peak voltage [V].
+        voltage: Peak voltage [V], or peak input in the unit of the input.
         slew: Fastest change [V/s].
-        peaks: Channel -> largest predicted |output|.
+        peaks: Channel -> largest predicted |output| [unit of the output].
         settled: Whether the fits of the rival models have converged.
     """
 
@@ -93,6 +111,8 @@ class Experiment:
         outputs: Runs if the first effect is true, and if the second effect is true.
         differences: Residuals of the rival fitted to each run, in units of the outputs.
         channels: Names of the outputs.
+        units: Units of the outputs.
+        input_unit: Unit of the input.
         noise: Channel -> standard deviation of the sensor noise.
         limits: Limits of the machine.
         notes: What the user must know before playing the input.
@@ -108,6 +128,8 @@ class Experiment:
     outputs: Float[np.ndarray, "2 N C"]
     differences: Float[np.ndarray, "2 N C"]
     channels: tuple[str, ...]
+    units: tuple[str, ...]
+    input_unit: str
     noise: dict[str, float]
     limits: Limits
     notes: tuple[str, ...] = ()
@@ -141,7 +163,8 @@ class Experiment:
         Raises:
             InputError: The folder does not exist, or the file cannot be written; an old one stays.
         """
-        return voltage_file(path, self.u, self.Ts, f"tells {one_line(' from '.join(self.separates))}")
+        purpose = f"tells {one_line(' from '.join(self.separates))}"
+        return voltage_file(path, self.u, self.Ts, purpose, self.input_unit)
 
     def plot(self) -> Any:
         """Figure: input over time, its spectrum, and predicted difference of the models with sensor noise."""
@@ -170,12 +193,13 @@ class Experiment:
     def __str__(self) -> str:
         c, rate = self.chosen, self.evidence["nats_per_second"]
         first, second = self.separates
-        peaks = ", ".join(f"{n} to {v:.3g}" for n, v in c.peaks.items())
+        unit, peaks = self.input_unit, _predicted(c.peaks, self.units)
         lines = [
             f"To tell {first} from {second}: {c.input}, {c.setting}, {len(self.u) * self.Ts:g} s",
             f"  expected evidence {c.nats:.3g} nats, {rate:.3g} per second; "
             f"best standard input {self.standard.input} ({self.standard.setting}): {self.standard.nats:.3g}",
-            f"  voltage to {c.voltage:.3g} V, slew to {c.slew:.3g} V/s, {peaks} rad predicted",
+            f"  {input_word(unit)} to {c.voltage:.3g} {unit}, slew to {c.slew:.3g} {unit}/s, "
+            f"{peaks} predicted",
         ]
         return "\n".join([*lines, *(f"  {note}" for note in self.notes)])
 
@@ -202,6 +226,8 @@ class Segment:
         limits: Limits of the machine.
         outputs: Outputs predicted by each model.
         channels: Names of the outputs.
+        units: Units of the outputs.
+        input_unit: Unit of the input.
     """
 
     rivals: tuple[str, ...]
@@ -219,6 +245,8 @@ class Segment:
     limits: Limits
     outputs: Float[np.ndarray, "H N C"]
     channels: tuple[str, ...]
+    units: tuple[str, ...]
+    input_unit: str
 
     @property
     def t(self) -> Float[np.ndarray, " N"]:
@@ -231,7 +259,8 @@ class Segment:
         Raises:
             InputError: The folder does not exist, or the file cannot be written; an old one stays.
         """
-        return voltage_file(path, self.u, self.Ts, f"tells {one_line(' from '.join(self.rivals))}")
+        purpose = f"tells {one_line(' from '.join(self.rivals))}"
+        return voltage_file(path, self.u, self.Ts, purpose, self.input_unit)
 
     def plot(self) -> Any:
         """Figure: the input, and the prediction of each model less the mean of all predictions."""
@@ -259,13 +288,14 @@ class Segment:
         }
 
     def __str__(self) -> str:
-        peaks = ", ".join(f"{n} to {v:.3g}" for n, v in self.peaks.items())
+        unit, peaks = self.input_unit, _predicted(self.peaks, self.units)
         return (
             f"To tell {', '.join(self.rivals)} apart: {self.input}, {self.setting}, "
             f"{len(self.u) * self.Ts:g} s\n"
             f"  after {self.repeats:g} of it a wrong answer has at most the probability "
             f"{self.expected_error:.2g}\n"
-            f"  voltage to {np.max(np.abs(self.u)):.3g} V, {peaks} rad predicted; best of {self.tried} inputs"
+            f"  {input_word(unit)} to {np.max(np.abs(self.u)):.3g} {unit}, {peaks} predicted; "
+            f"best of {self.tried} inputs"
         )
 
 
@@ -327,6 +357,11 @@ class SequentialResult:
     limits: Limits
     reason: str = ""
     notes: tuple[str, ...] = ()
+
+    @property
+    def input_unit(self) -> str:
+        """Unit of the input."""
+        return self.runs[0].input_unit if self.runs else "V"
 
     @property
     def best(self) -> str:
@@ -393,7 +428,11 @@ class SequentialResult:
         return card(
             self.verdict.capitalize(),
             paragraph(self.sentence),
-            table(("on the rig [s]", "input", "peak [V]", *(f"{n} [%]" for n in self.rivals)), rows, words=2),
+            table(
+                ("on the rig [s]", "input", f"peak [{self.input_unit}]", *(f"{n} [%]" for n in self.rivals)),
+                rows,
+                words=2,
+            ),
             bullets(self.notes),
         )
 
@@ -401,5 +440,7 @@ class SequentialResult:
         lines = [self.sentence]
         for s in self.history:
             listed = ", ".join(f"{n} {100 * p:.3g} %" for n, p in s.probabilities.items())
-            lines.append(f"  {s.seconds:6g} s  {s.input}, {s.setting}, {s.voltage:.3g} V: {listed}")
+            lines.append(
+                f"  {s.seconds:6g} s  {s.input}, {s.setting}, {s.voltage:.3g} {self.input_unit}: {listed}"
+            )
         return "\n".join([*lines, *(f"  {n}" for n in self.notes)])

@@ -54,8 +54,11 @@ class SimulatedRig(Rig):
         model: Model of the machine.
         limits: Limits of the machine.
         Ts: Sampling period [s].
-        noise: Channel -> standard deviation of the sensor noise.
+        noise: Channel -> standard deviation of the sensor noise; channels that are not named have none.
         seed: Seed of the noise.
+
+    Raises:
+        InputError: An argument is out of range, or the noise is that of no channel.
     """
 
     def __init__(
@@ -67,13 +70,20 @@ class SimulatedRig(Rig):
         seed: int = 0,
     ) -> None:
         self.model, self.limits, self.Ts = (
-            Model.of(model),
+            Model.of(model).without_gates(),
             checked_limits(limits),
             checks.positive(Ts, "Ts", "s", "0.002"),
         )
         check_input_alone(self.model.mechanism, "a simulated rig")
         channels = self.model.mechanism.channels
-        given = noise or {}
+        given = {} if noise is None else noise
+        strange = [c for c in given if c not in channels] if isinstance(given, Mapping) else None
+        if strange or strange is None:
+            what = f"names {strange[0]!r}" if strange else f"is {checks.shown(noise)}"
+            raise InputError(
+                f"Argument `noise` must be standard deviations by the channels {', '.join(channels)}, but "
+                f"{what}; give for instance {{{channels[0]!r}: 5e-4}}."
+            )
         self._sd = np.array(
             [checks.number(given.get(c, 0.0), "noise", least=0, example="{'theta': 5e-4}") for c in channels]
         )

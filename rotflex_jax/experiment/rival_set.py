@@ -20,6 +20,7 @@ from jaxtyping import Array, Float, Int
 from rotflex_jax.experiment.rival_fit import MAX_STEPS, RULES, limits_of_unknowns, with_calibrations
 from rotflex_jax.mechanism import Mechanism, Solver, free_run, kalman_gains, linearise, predictor_run
 from rotflex_jax.mechanism.assembly import Layout, rest_state
+from rotflex_jax.mechanism.linear import output_units
 from rotflex_jax.models.model import Model
 from rotflex_jax.optimise.damped_least_squares import NormalEquations, minimise
 from rotflex_jax.parameters import Transform
@@ -187,6 +188,11 @@ class RivalSet:
     def count(self) -> int:
         """Number of rivals."""
         return len(self.labels)
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Units of the outputs."""
+        return tuple(output_units(self.structure).values())
 
     @property
     def layout(self) -> Layout:

@@ -396,6 +396,8 @@ class SegmentChoice:
             limits=self.limits,
             outputs=self.outputs(U[top : top + 1])[0, :, 0, : self.M],
             channels=self.r.structure.channels,
+            units=self.r.units,
+            input_unit=self.r.structure.units.input,
         )
         return segment, self._too_small(T[-1], left, tried, label(int(order[0])))
 

@@ -20,7 +20,13 @@ from jaxtyping import Float
 from rotflex_jax import checks
 from rotflex_jax.errors import InputError
 from rotflex_jax.experiment.common_structure import UNKNOWN_SHARE, rival_set
-from rotflex_jax.experiment.result import Segment, SequentialResult, SequentialStep, json_limits
+from rotflex_jax.experiment.result import (
+    Segment,
+    SequentialResult,
+    SequentialStep,
+    input_word,
+    json_limits,
+)
 from rotflex_jax.experiment.rig import checked_limits
 from rotflex_jax.experiment.rival_set import RivalPosterior, RivalSet, RunData
 from rotflex_jax.experiment.segment_choice import BEFORE, SegmentChoice
@@ -196,7 +202,7 @@ class SequentialExperiment:
             else {
                 f.name: v.tolist() if isinstance(v := getattr(planned, f.name), np.ndarray) else v
                 for f in dataclasses.fields(planned)
-                if f.name != "limits"
+                if f.name not in ("limits", "units", "input_unit")
             },
             "played": self.played,
         }
@@ -228,7 +234,9 @@ class SequentialExperiment:
                 arrays = {k: np.array(planned[k], float) for k in ("u", "nats", "outputs")}
                 tuples = {k: tuple(planned[k]) for k in ("rivals", "probabilities", "channels")}
                 table = tuple(tuple(row) for row in planned["table"])
-                planned = Segment(**(planned | arrays | tuples | {"table": table, "limits": settings.limits}))
+                known = {"units": rivals.units, "input_unit": rivals.structure.units.input}
+                known |= {"table": table, "limits": settings.limits}
+                planned = Segment(**(planned | arrays | tuples | known))
             channels = len(rivals.noise)
             return cls(
                 rivals,
@@ -373,7 +381,16 @@ class SequentialExperiment:
             seconds=self.seconds,
             history=self.history,
             runs=tuple(
-                Recording(u=x.u, y=x.y, Ts=r.Ts, channels=r.structure.channels, accept=_ANYTHING)
+                Recording(
+                    u=x.u,
+                    y=x.y,
+                    Ts=r.Ts,
+                    channels=r.structure.channels,
+                    units=r.units,
+                    input_name=input_word(r.structure.units.input),
+                    input_unit=r.structure.units.input,
+                    accept=_ANYTHING,
+                )
                 for x in self.runs
                 if np.ptp(x.u) > 0 and len(x.u) >= SHORTEST_RECORDING
             ),

@@ -8,9 +8,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Real
 
-from rotflex_jax.checks import positive, shown, signal
+from rotflex_jax.checks import positive, signal
 from rotflex_jax.effects.base import Effect, Memory
-from rotflex_jax.errors import InputError
 from rotflex_jax.mechanism import Mechanism, simulate
 from rotflex_jax.mechanism.mechanism import check_input_alone
 from rotflex_jax.models.model import Model
@@ -124,7 +123,7 @@ class Subject:
         """
         model, Ts = Model.of(model), positive(Ts, "Ts", example="0.002")
         check_input_alone(model.mechanism, "an exported model")
-        model = _switched_on(model)
+        model = model.without_gates()
         unit = model.mechanism.units.input
         if u is None:
             size = _AMPLITUDES.get(unit, 1.0)
@@ -225,19 +224,6 @@ def standard_input(Ts: float, size: float) -> Float[np.ndarray, " N"]:
 def label(effect: Effect) -> str:
     """Name of an effect in certificates."""
     return f"{effect.title} {effect.location} ({effect.name})"
-
-
-def _switched_on(model: Model) -> Model:
-    if model.gates is None:
-        return model
-    if any(g not in (0.0, 1.0) for g in model.gates):
-        raise InputError(
-            f"The gates of the model are {shown(model.gates)}, but a simulator knows effects that are on or "
-            "off; give 1 or 0 for each."
-        )
-    on = [e for e, g in zip(model.mechanism.effects, model.gates, strict=True) if g]
-    mechanism = dataclasses.replace(model.mechanism, effects=tuple(on), trusted=frozenset())
-    return Model(mechanism, model.solver)
 
 
 def in_comment(text: str) -> str:

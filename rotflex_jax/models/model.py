@@ -115,6 +115,24 @@ class Model:
         gates = None if self.gates is None else (*self.gates, 1.0)
         return dataclasses.replace(self, mechanism=self.mechanism + effect, gates=gates)
 
+    def without_gates(self) -> "Model":
+        """The model without the effects that its gates switch off.
+
+        Raises:
+            InputError: A gate is neither 0 nor 1.
+        """
+        if self.gates is None:
+            return self
+        if any(g not in (0.0, 1.0) for g in self.gates):
+            raise InputError(
+                f"The gates of the model are {', '.join(f'{g:g}' for g in self.gates)}, but only effects "
+                "that are on or off are taken here; give 1 or 0 for each."
+            )
+        m = self.mechanism
+        for e, gate in zip(m.effects, self.gates, strict=True):
+            m = m if gate else m.without(e.name, e.at)
+        return dataclasses.replace(self, mechanism=m, gates=None)
+
     def save(self, path: str | Path) -> Path:
         """Write the model as JSON; `Model.load` restores it bit for bit."""
         from rotflex_jax.models.model_json import Saved, save  # imported on request: it needs this module
