@@ -254,6 +254,7 @@ def test_nlms_fixed_point_is_least_squares_where_the_model_is_complete() -> None
         (lambda: Kalman(q=-1.0), "`q`"),
         (lambda: Kalman(r=0.0), "`r`"),
         (lambda: fixed_point(np.ones(3), np.ones(3)), r"shapes \(N, P\) and \(N,\)"),
+        (lambda: fixed_point(np.full((3, 1), np.nan), np.ones(3)), "`phi` must be finite"),
     ],
 )
 def test_settings_out_of_range_are_refused(make, phrase: str) -> None:

@@ -270,6 +270,13 @@ def test_the_summary_says_inside_or_outside() -> None:
         (lambda: analyse(WHITE, 0.0), "one above zero"),
         (lambda: settling_step_size(0.0, 7000), "positive eigenvalue"),
         (lambda: settling_samples(WHITE, 0.01, np.zeros(21), 0), "best value 0"),
+        (lambda: settling_samples(WHITE, 0.01, np.ones(21), 21), "`coefficient` must be .* from 0 to 20"),
+        (lambda: settling_samples(WHITE, 0.01, np.ones(3), 0), "`weights` must be 21 numbers"),
+        (lambda: learning_curve(WHITE, 0.01, np.ones(3), np.arange(3.0)), "`weights` must be 21 numbers"),
+        (
+            lambda: learning_curve(WHITE, 0.01, np.ones(21), np.arange(3.0), start=np.ones(2)),
+            "`start` must be 21 numbers",
+        ),
     ],
 )
 def test_what_makes_no_sense_is_refused(call: object, phrase: str) -> None:

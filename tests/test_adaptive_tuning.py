@@ -306,6 +306,7 @@ def test_the_summary_names_the_objective_and_what_was_found(short: list[Recordin
         ({"start": [{"mu1": 1.0, "mu2": 1.0}, {"mu1": 1.0}]}, "name the same settings"),
         ({"start": {"mu1": -1.0, "mu2": 1.0}}, "`mu1` must start between 0 and inf"),
         ({"ranges": {"mu2": (1.0, 0.0)}}, "range of `mu2` must rise"),
+        ({"ranges": {"mu": (0.0, 1.0)}}, "`ranges` names 'mu', but the settings are mu1, mu2;"),
         ({"evaluations": 0}, "`evaluations`"),
         ({"margin": -1.0}, "A margin is a positive factor"),
     ],
@@ -315,6 +316,27 @@ def test_what_cannot_be_tuned_is_refused(short: list[Recording], change: dict, p
     start, records = options.pop("start"), short[: options.pop("recordings")]
     with pytest.raises(InputError, match=phrase):
         tune(two_steps, start, BASIS, records, "alpha", **options)
+
+
+def test_test_recordings_are_checked_before_anything_is_tuned(short: list[Recording]) -> None:
+    calls = []
+
+    def counted(settings: dict) -> LMS:
+        calls.append(settings)
+        return two_steps(settings)
+
+    given = {"basis": BASIS, "recordings": short[:2], "channel": "alpha", "objective": "final"}
+    for search, settings in ((grid, {"mu1": [0.01], "mu2": [0.01]}), (tune, {"mu1": 0.01, "mu2": 0.01})):
+        with pytest.raises(InputError, match='"final" needs 2 recordings or more in `test`, but 1 was given'):
+            search(counted, settings, **given, test=short[2:])
+    assert not calls
+
+
+def test_one_recording_needs_no_list(short: list[Recording]) -> None:
+    given = {"basis": BASIS, "channel": "alpha", "objective": "last_half"}
+    alone = grid(two_steps, {"mu1": [0.01], "mu2": [0.01]}, recordings=short[0], test=short[1], **given)
+    in_lists = grid(two_steps, {"mu1": [0.01], "mu2": [0.01]}, recordings=short[:1], test=short[1:2], **given)
+    assert (alone.value, alone.test) == (in_lists.value, in_lists.test)
 
 
 def test_recordings_of_different_length_are_refused(short: list[Recording]) -> None:

@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float, Real
 
 from rotflex_jax.adaptive.moments import Moments, pack
 from rotflex_jax.adaptive.step_sizes import StepSizes, pack_sum, recursion, step_sizes
+from rotflex_jax.checks import vector, whole
 from rotflex_jax.errors import InputError
 
 LONGEST_SETTLING = 1e8
@@ -74,13 +75,11 @@ def learning_curve(
         start: first weights; zero if None.
 
     Raises:
-        InputError: the step sizes are not valid, as in `analyse`.
+        InputError: the step sizes are not valid, as in `analyse`, or the weights are not one for each
+            regressor.
     """
     exact, moving = recursion(moments, mu)
-    best, first = (
-        np.asarray(weights, float),
-        np.zeros(moments.size) if start is None else np.asarray(start, float),
-    )
+    best, first = _ends(moments, weights, start)
     t = np.asarray(times, dtype=float)
     delta = (first - best)[moving] / exact.root
     along = exact.vectors.T @ delta
@@ -97,6 +96,16 @@ def learning_curve(
         C = power * begin + (1 - power) / (1 - rates) * drive
         excess = C @ (modes.T @ pack(np.diag(exact.values)))
     return LearningCurve(t, mean, excess)
+
+
+def _ends(
+    moments: Moments, weights: Float[np.ndarray, " P"], start: Float[np.ndarray, " P"] | None
+) -> tuple[Float[np.ndarray, " P"], Float[np.ndarray, " P"]]:
+    """Best and first weights, as many as there are regressors."""
+    example = f"numpy.ones({moments.size})"
+    first = np.zeros(moments.size) if start is None else start
+    best = vector(weights, "weights", moments.size, example=example)
+    return best, vector(first, "start", moments.size, example=example)
 
 
 def settling_samples(
@@ -122,15 +131,15 @@ def settling_samples(
         The number of samples; infinite if the weight never settles.
 
     Raises:
-        InputError: the best value of the weight is zero.
+        InputError: the best value of the weight is zero, or there is no such weight.
     """
     exact, moving = recursion(moments, mu)
-    best = np.asarray(weights, float)
+    best, first = _ends(moments, weights, start)
+    coefficient = whole(coefficient, "coefficient", 0, moments.size - 1)
     if best[coefficient] == 0:
         raise InputError(
             f"Weight {coefficient} has the best value 0, and no share of it can be taken; choose another one."
         )
-    first = np.zeros(moments.size) if start is None else np.asarray(start, float)
     if not moving[coefficient]:
         return float("inf") if first[coefficient] != best[coefficient] else 0.0
     row = int(np.sum(moving[:coefficient]))

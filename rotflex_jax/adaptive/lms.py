@@ -13,6 +13,7 @@ from rotflex_jax.adaptive.filter import (
     PerWeight,
     Weights,
     count,
+    finite,
     per_weight,
     real_data,
     times,
@@ -122,7 +123,7 @@ def fixed_point(
         eps: constant `eps` of the filter [regressor^2].
 
     Raises:
-        InputError: shapes do not fit, or `eps` is not positive.
+        InputError: shapes do not fit, numbers are not finite, or `eps` is not positive.
 
     >>> phi = np.array([[1.0], [2.0], [3.0]])
     >>> fixed_point(phi, 2 * phi[:, 0]).round(6)
@@ -135,6 +136,7 @@ def fixed_point(
             f"Arguments `phi` and `y` must have the shapes (N, P) and (N,), but have {phi.shape} and "
             f"{y.shape}; give one row of regressors per output sample."
         )
+    phi, y = finite(phi, y)
     root = 1 / np.sqrt(eps + np.sum(phi**2, axis=1))
     return np.linalg.lstsq(phi * root[:, None], y * root, rcond=None)[0]
 

@@ -28,6 +28,7 @@ from rotflex_jax.adaptive.step_sizes import Stability, analyse
 from rotflex_jax.basis import Basis
 from rotflex_jax.errors import InputError
 from rotflex_jax.recording import Recording
+from rotflex_jax.recording.recording import listed
 from rotflex_jax.recording.samples import of_one_period
 from rotflex_jax.runtime.xla import double_precision, spread
 
@@ -203,7 +204,13 @@ class TuningData(eqx.Module):
     smallest: Float[Array, " K"]
 
 
-def tuning_data(basis: Basis, recordings: Sequence[Recording], channel: str, objective: str) -> TuningData:
+def tuning_data(
+    basis: Basis,
+    recordings: Recording | Sequence[Recording],
+    channel: str,
+    objective: str,
+    name: str = "recordings",
+) -> TuningData:
     """Recordings prepared for an objective.
 
     Args:
@@ -211,6 +218,7 @@ def tuning_data(basis: Basis, recordings: Sequence[Recording], channel: str, obj
         recordings: recordings of one length and sampling period; at least two for "final".
         channel: output of the filter.
         objective: "final", "mean_error" or "last_half".
+        name: name of the argument with the recordings.
 
     Raises:
         InputError: the objective is unknown, there are too few recordings, or they differ in length or
@@ -221,11 +229,11 @@ def tuning_data(basis: Basis, recordings: Sequence[Recording], channel: str, obj
             f"Argument `objective` must be one of {', '.join(get_args(Objective))}, but is {objective!r}; "
             "choose one."
         )
-    least = 2 if objective == "final" else 1
-    if len(recordings) < least:
+    recordings = listed(recordings, name)
+    if objective == "final" and len(recordings) < 2:
         raise InputError(
-            f'The objective "{objective}" needs {least} recordings or more, but {len(recordings)} were '
-            "given; cut a long one with Recording.slice."
+            f'The objective "final" needs 2 recordings or more in `{name}`, but 1 was given; cut a long one '
+            "with Recording.slice."
         )
     lengths, periods = sorted({r.N for r in recordings}), {r.Ts for r in recordings}
     if len(lengths) > 1 or not of_one_period(periods):
@@ -427,12 +435,12 @@ def tuning_result(
     build: FilterBuilder,
     settings: Mapping[str, float],
     basis: Basis,
-    recordings: Sequence[Recording],
+    recordings: Recording | Sequence[Recording],
     channel: str,
     data: TuningData,
     *,
     objective: Objective,
-    test: Sequence[Recording],
+    test: TuningData | None,
     value: float | None = None,
     **rest: Any,
 ) -> Tuned:
@@ -445,7 +453,7 @@ def tuning_result(
         def value_on(data: TuningData) -> float:
             return float(values_at(point, data, names=names, build=build, objective=objective)[0])
 
-        tested = value_on(tuning_data(basis, test, channel, objective)) if test else float("nan")
+        tested = float("nan") if test is None else value_on(test)
         stability: Stability | None = None
         if isinstance(filter, LMS) and data.phi.shape[2] <= MOST_WEIGHTS_FOR_STABILITY:
             # Other poles are other regressors.

@@ -279,6 +279,7 @@ class Identified:
         Args:
             recording: recording that the filter did not use; its first `n_init` samples do not count.
         """
+        recording = single(recording, "recording")
         y = _scored(recording, self.channel)
         return _relative(y - self.model.simulate(recording)[recording.n_init :, 0], y)
 

@@ -40,11 +40,11 @@ def grid(
     build: FilterBuilder,
     axes: Mapping[str, Any],
     basis: Basis,
-    recordings: Sequence[Recording],
+    recordings: Recording | Sequence[Recording],
     channel: str,
     *,
     objective: Objective,
-    test: Sequence[Recording] = (),
+    test: Recording | Sequence[Recording] = (),
     devices: Sequence[Any] | None = None,
 ) -> Tuned:
     """The objective of `tune` at every combination of given settings.
@@ -79,6 +79,7 @@ def grid(
     points = np.array(list(itertools.product(*tried.values())))
     with double_precision():
         data = tuning_data(basis, recordings, channel, objective)
+        tested = tuning_data(basis, test, channel, objective, "test") if test else None
         mesh = mesh_of(devices)
         run = values_at(
             jnp.asarray(points), data, names=tuple(tried), build=build, objective=objective, mesh=mesh
@@ -95,7 +96,7 @@ def grid(
         channel,
         data,
         objective=objective,
-        test=test,
+        test=tested,
         value=float(values[best]),
         evaluations=len(points),
         axes=tried,
@@ -107,11 +108,11 @@ def tune(
     build: FilterBuilder,
     start: Mapping[str, float] | Sequence[Mapping[str, float]],
     basis: Basis,
-    recordings: Sequence[Recording],
+    recordings: Recording | Sequence[Recording],
     channel: str,
     *,
     objective: Objective,
-    test: Sequence[Recording] = (),
+    test: Recording | Sequence[Recording] = (),
     ranges: Mapping[str, tuple[float, float]] | None = None,
     evaluations: int = 60,
     margin: float = 0.0,
@@ -135,7 +136,8 @@ def tune(
         recordings: recordings for tuning, of one length; the filter starts again on each.
         channel: output of the filter.
         objective: "final", "mean_error" or "last_half"; each has a different optimum.
-        test: other recordings, on which the result is evaluated with the same objective.
+        test: other recordings, on which the result is evaluated with the same objective; two or more for
+            "final".
         ranges: name of a setting -> its range, which is 0 to infinity by default. A range with a finite upper
             end is transformed by a logistic function, any other by the logarithm above its lower end.
         evaluations: most runs of the filter per start, each with all derivatives.
@@ -151,10 +153,16 @@ def tune(
     count("evaluations", evaluations)
     starts = starting_sets(start)
     names = tuple(starts[0])
+    if strange := [name for name in ranges or {} if name not in names]:
+        raise InputError(
+            f"Argument `ranges` names {strange[0]!r}, but the settings are {', '.join(names)}; name one of "
+            "these."
+        )
     curve = RangeTransform(names, tuple((ranges or {}).get(name, (0.0, float("inf"))) for name in names))
     first = np.stack([curve.free(s) for s in starts])
     with double_precision():
         data = tuning_data(basis, recordings, channel, objective)
+        tested = tuning_data(basis, test, channel, objective, "test") if test else None
         guard = _guard(margin, data, *build_filter(build, starts[0])) if margin else None
 
         def values(points: Float[np.ndarray, "S n"]) -> Values:
@@ -192,7 +200,7 @@ def tune(
         channel,
         data,
         objective=objective,
-        test=test,
+        test=tested,
         # With a margin, the last value includes the penalty and is not the objective.
         value=float(best.values[-1]) if guard is None else None,
         evaluations=sum(p.evaluations for p in paths),
