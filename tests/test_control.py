@@ -5,6 +5,7 @@ import dataclasses
 import shutil
 import subprocess
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -280,6 +281,43 @@ def test_other_channels_are_refused():
         close_loop(found, One(), np.zeros(50))
 
 
+class Reading:
+    """A machine that counts how often it is driven, with readings that are given."""
+
+    def __init__(self, *readings: Any) -> None:
+        self.readings, self.driven = list(readings), 0
+
+    def read(self) -> Any:
+        return self.readings[min(self.driven, len(self.readings) - 1)]
+
+    def advance(self, voltage: float) -> None:
+        assert np.isfinite(voltage)
+        self.driven += 1
+
+
+def test_a_machine_is_not_driven_by_readings_that_are_no_numbers():
+    found, fine = rf.controller(JOINT, TS), np.zeros(2)
+    for wrong, phrase in (
+        (
+            [0.0, np.nan],
+            "reads nan for alpha at sample 2, but a machine is driven by readings that are numbers",
+        ),
+        ("off", "reads 'off', but the model has the channels theta, alpha"),
+        (np.zeros(3), "reads 3 values, but"),
+    ):
+        machine = Reading(fine, fine, wrong)
+        with pytest.raises(InputError, match=phrase):
+            close_loop(found, machine, np.zeros(50))
+        assert machine.driven == 2
+
+
+def test_a_machine_whose_position_is_not_shown_is_not_driven_at_all():
+    machine = Reading(np.zeros(1))
+    with pytest.raises(InputError, match="The readings theta do not show the position of 'arm'"):
+        close_loop(rf.controller(rf.joints.paper(sensors="theta"), TS, port="arm"), machine, np.zeros(50))
+    assert machine.driven == 0
+
+
 # -- C code ----------------------------------------------------------------------------------------------
 
 
@@ -379,6 +417,7 @@ def test_the_input_of_a_servo_is_no_voltage():
     assert "u: input [rad], at most 1.5" in controller_to_c(servo)
     both = rf.controller(rf.joints.paper(sensors="theta+alpha+speed"), 0.002)
     assert "y: theta [rad], alpha [rad], speed [rad/s];" in controller_to_c(both)
+    assert "input at its limit" in str(close_loop(servo, xl330_pendulum(), np.zeros(50)))
     with pytest.raises(InputError, match=r"limit.*\[rad\]"):
         rf.controller(xl330_pendulum(), 0.005, limit=0)
 

@@ -117,6 +117,9 @@ def test_refuses_a_point_of_another_size():
         state_space(Model(paper()), positions=(0, 0, 0))
     with pytest.raises(InputError, match="is in discrete time already"):
         state_space(Model(paper()), 0.01).discretise(0.01)
+    for Ts in ("0.01", None, True):
+        with pytest.raises(InputError, match="`Ts` must be a finite number above 0"):
+            state_space(Model(paper())).discretise(Ts)
 
 
 @pytest.mark.parametrize("name", sorted(CATALOG))

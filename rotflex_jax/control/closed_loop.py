@@ -178,8 +178,8 @@ class ClosedLoop:
             size, size_in = readable(cycle.amplitude, unit)
             ends = f"limit cycle of {size:.3g} {size_in} at {cycle.frequency:.3g} Hz"
         return (
-            f"Tracking error {rms:.3g} {shown_in} rms, at most {worst:.3g} {worst_in}; {ends}; voltage at "
-            f"its limit in {100 * self.saturated:.3g} % of the samples."
+            f"Tracking error {rms:.3g} {shown_in} rms, at most {worst:.3g} {worst_in}; {ends}; "
+            f"{self.controller.input_name} at its limit in {100 * self.saturated:.3g} % of the samples."
         )
 
     def plot(self, *others: "ClosedLoop") -> "Figure":
@@ -277,7 +277,8 @@ def close_loop(
         ClosedLoop.
 
     Raises:
-        InputError: `plant` is neither a model nor a machine, its channels are not the controller's, or
+        InputError: `plant` is neither a model nor a machine, its channels are not the controller's, a reading
+            is no finite number, the readings of a machine do not show the position of the port, or
             `reference` is no signal.
     """
     noise = number(noise, "noise", least=0.0, unit="rad", example="0.001")
@@ -302,22 +303,37 @@ def run_loop(
             f"Argument `plant` must be a model, or an object with read() and advance(voltage), but is "
             f"{shown(plant)}; give for instance the fitted model."
         )
-    gains = _gains(controller)
+    gains, weights = _gains(controller), _position_of(controller)
     N, n = len(motion.voltage), len(controller.row)
     Y, u = np.empty(motion.outputs.shape), np.empty(N)
     E = np.empty((N, n + 1))
     e = np.zeros(n + 1)
     for k in range(N):
-        y = np.asarray(plant.read(), float)
-        if y.shape != Y[k].shape:
-            raise InputError(
-                f"Argument `plant` reads {y.size} values, but the model has the channels "
-                f"{', '.join(controller.model.mechanism.channels)}; return one reading of each."
-            )
-        Y[k] = y
+        y = Y[k] = _readings(plant.read(), controller.model.mechanism.channels, k)
         u[k], E[k], e = _feedback(gains, e, y, motion.outputs[k], motion.voltage[k])
         plant.advance(float(u[k]))
-    return _result(controller, motion, Y, Y @ _position_of(controller), u, E)
+    return _result(controller, motion, Y, Y @ weights, u, E)
+
+
+def _readings(given: Any, channels: tuple[str, ...], k: int) -> Float[np.ndarray, " C"]:
+    """The readings of a machine at sample `k`; the machine is not driven on without them."""
+    try:
+        y = np.asarray(given, float)
+    except (TypeError, ValueError):
+        y = np.asarray(np.nan)
+    if y.shape != (len(channels),):
+        what = f"{y.size} values" if y.ndim else shown(given)
+        raise InputError(
+            f"Argument `plant` reads {what}, but the model has the channels {', '.join(channels)}; return "
+            "one reading of each."
+        )
+    if not np.all(np.isfinite(y)):
+        c = int(np.argmin(np.isfinite(y)))
+        raise InputError(
+            f"Argument `plant` reads {y[c]} for {channels[c]} at sample {k}, but a machine is driven by "
+            "readings that are numbers; check that sensor."
+        )
+    return y
 
 
 def _with_model(

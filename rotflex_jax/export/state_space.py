@@ -57,10 +57,9 @@ class LinearModel:
         """
         if self.Ts is not None:
             raise InputError("The model is in discrete time already; discretise the continuous one.")
-        if not (np.isfinite(Ts) and Ts > 0):
-            raise InputError(f"Ts was given as {Ts!r}, but it is a sampling period in seconds; give one.")
+        Ts = positive(Ts, "Ts", example="0.002")
         A, B = zero_order_hold(self.A, self.B, Ts)
-        return dataclasses.replace(self, A=A, B=B, Ts=float(Ts))
+        return dataclasses.replace(self, A=A, B=B, Ts=Ts)
 
     def to_control(self) -> Any:
         """The model as `StateSpace` of the package python-control, with names of its signals.
