@@ -292,6 +292,29 @@ def test_what_is_saved_in_other_units_keeps_them(tmp_path: Path) -> None:
     np.testing.assert_allclose(again.y, Y, rtol=1e-14)
 
 
+def test_a_unit_of_the_file_is_not_called_radians(tmp_path: Path) -> None:
+    speed = write_text(tmp_path / "speed.csv", "t,voltage,theta [rad],n [rad/s]")
+    assert load(speed, outputs={"theta": "theta", "speed": "n"}).units == ("rad", "rad/s")
+    turned = load(write_text(tmp_path / "deg.csv", "t,voltage,theta [deg],n [deg/s]"), outputs=("theta", "n"))
+    assert turned.units == ("rad", "rad/s")
+    np.testing.assert_allclose(turned.y, np.deg2rad(Y), rtol=1e-14)
+    remark = write_text(tmp_path / "remark.csv", "t,voltage,theta (measured),alpha (strain gauge)")
+    assert load(remark).units == ("rad", "rad")
+    small = write_text(tmp_path / "small.csv", "t,voltage,theta [mrad],alpha [mrad]")
+    counted = write_text(tmp_path / "counted.csv", "t,voltage,theta [counts],alpha [rad]")
+    assert load(small, units={"theta": "mrad", "alpha": "mrad"}).units == ("mrad", "mrad")
+    assert load(small, accept=("units",)).units == ("rad", "rad")
+    assert load(counted, counts={"theta": 4096}, accept=("swapped",)).units == ("rad", "rad")
+    for path, options, phrase in (
+        (small, {}, r"is in mrad by its name, but an output .* pass units=\{'theta': 'mrad'\}, or convert"),
+        (small, {"units": {"theta": "m"}}, "is in mrad by its name, but was given in m; leave out that unit"),
+        (small, {"degrees": True}, "is in mrad by its name, but degrees=True was given"),
+        (counted, {}, "is in counts by its name, but an output .* pass counts=4096 or what one turn has,"),
+    ):
+        with pytest.raises(InputError, match=phrase):
+            load(path, **options)
+
+
 def test_unit_of_nothing_in_the_recording_is_refused(tmp_path: Path) -> None:
     path = write_text(tmp_path / "run.csv")
     assert load(path, units={"theta": "rad", "voltage": "V"}).units == ("rad", "rad")

@@ -44,6 +44,13 @@ ANGLE_UNITS = {"rad": {"rad", "rads", "radian", "radians"}, "deg": set(DEGREES)}
 INPUT_UNITS = {"V": {"v", "volt", "volts", "voltage"}, "A": {"a", "amp", "ampere", "amperes"}} | ANGLE_UNITS
 """Unit of an input -> its spellings in lower case."""
 
+COUNT_UNITS = frozenset({"count", "counts", "cnt", "cnts", "tick", "ticks"})
+OTHER_UNITS = COUNT_UNITS | {
+    *("mrad", "urad", "µrad", "μrad", "rev", "revs", "turn", "turns", "gon", "rpm"),
+    *("m", "cm", "mm", "um", "µm", "μm", "inch", "m/s", "mm/s", "v", "mv", "ma"),
+}
+"""Lower-case units of outputs other than radians and degrees; other words in brackets are remarks."""
+
 
 def unused_sensors(table: Table, channels: Sequence[str], used: set[str]) -> list[Finding]:
     """Finding on further sensors of a joint in the file, if only one sensor is read."""
@@ -229,6 +236,8 @@ def output(
         accepted: Faults that the user accepts.
     """
     label = f"{table.label}: column {name!r}"
+    if counts is None and "units" not in accepted:
+        _check_other_unit(table, channel, name, unit, degrees)
     turned = None if unit is None else in_radians(unit)
     if unit is not None and not (turned or unit.startswith("rad")):
         if degrees or counts is not None:
@@ -261,8 +270,9 @@ def output(
             f"{label} is in {said} by its {source}, but was given in {unit}; leave out that unit, or correct "
             "what the file says."
         )
+    own = _own_radians(_unit(table, name))
     if not (turned or degrees or said == "deg"):
-        return values, unit or "rad"
+        return values, unit or own
     if whole_numbers(values) and "units" not in accepted:
         # In degrees, no encoder of a joint would be so coarse, and no arm would deflect so far.
         most = 90.0 if channel == "alpha" else 1000.0
@@ -272,7 +282,40 @@ def output(
                 "encoder are, but was to be converted from degrees; give the counts of one turn in the place "
                 "of degrees, counts=4096 for instance, or accept=('units',)."
             )
-    return np.deg2rad(values), turned or unit or "rad"
+    return np.deg2rad(values), turned or unit or own
+
+
+def _own_radians(unit: str) -> str:
+    """The unit in radians, or in radians per time, of a column with a unit in radians or degrees."""
+    angle, slash, time = unit.partition("/")
+    is_angle = any(angle.strip().lower() in spellings for spellings in ANGLE_UNITS.values())
+    return f"rad{slash}{time}" if is_angle else "rad"
+
+
+def _check_other_unit(table: Table, channel: str, name: str, given: str | None, degrees: bool) -> None:
+    """Refuses a column that by the file is in neither radians nor degrees, unless its unit is given."""
+    own = _unit(table, name)
+    if own.lower() not in OTHER_UNITS or (given or "").lower() == own.lower():
+        return
+    said = f"{table.label}: column {name!r} is in {own} by its {_unit_source(name, own)}"
+    if given is not None:
+        raise InputError(
+            f"{said}, but was given in {given}; leave out that unit, or correct what the file says."
+        )
+    if degrees:
+        raise InputError(
+            f"{said}, but degrees=True was given, which is for all outputs; leave degrees=True out, and give "
+            "the unit of each output, such as units={'theta': 'deg'}."
+        )
+    keep = (
+        "counts=4096 or what one turn has"
+        if own.lower() in COUNT_UNITS
+        else f"units={{{channel!r}: {own!r}}}"
+    )
+    raise InputError(
+        f"{said}, but an output is taken in rad unless its unit is given; pass {keep}, or convert and rename "
+        "the column."
+    )
 
 
 def _angle_unit(table: Table, name: str) -> tuple[str | None, str]:
