@@ -315,6 +315,16 @@ def test_a_unit_of_the_file_is_not_called_radians(tmp_path: Path) -> None:
             load(path, **options)
 
 
+@pytest.mark.parametrize("unit", ["ns", "min", "h"])
+def test_a_time_in_a_unit_that_is_not_read_is_refused(unit: str, tmp_path: Path) -> None:
+    path = write_text(tmp_path / "run.csv", f"t [{unit}],voltage,theta,alpha")
+    with pytest.raises(
+        InputError, match=rf"'t \[{unit}\]' is in {unit} by its name, but a time is read in s, ms"
+    ):
+        load(path)
+    assert load(path, accept=("units",)).Ts == pytest.approx(Ts)
+
+
 def test_unit_of_nothing_in_the_recording_is_refused(tmp_path: Path) -> None:
     path = write_text(tmp_path / "run.csv")
     assert load(path, units={"theta": "rad", "voltage": "V"}).units == ("rad", "rad")

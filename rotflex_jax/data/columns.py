@@ -40,6 +40,9 @@ TIME_WORDS = {
 }
 """Other spellings of units of time."""
 
+OTHER_TIMES = frozenset({"ns", "min", "minute", "minutes", "h", "hour", "hours"})
+"""Units of time in lower case that are not read."""
+
 ANGLE_UNITS = {"rad": {"rad", "rads", "radian", "radians"}, "deg": set(DEGREES)}
 INPUT_UNITS = {"V": {"v", "volt", "volts", "voltage"}, "A": {"a", "amp", "ampere", "amperes"}} | ANGLE_UNITS
 """Unit of an input -> its spellings in lower case."""
@@ -364,6 +367,12 @@ def time_stamps(
         raise InputError(
             f"{table.label}: column {name!r} is in {said} by its {source}, but time_unit={time_unit!r} was "
             f"given; pass time_unit={said!r}, or correct what the file says."
+        )
+    own = _unit(table, name)
+    if own.lower() in OTHER_TIMES and not any_unit:
+        raise InputError(
+            f"{table.label}: column {name!r} is in {own} by its {_unit_source(name, own)}, but a time is "
+            f"read in {', '.join(TIME_UNITS)}; convert and rename it."
         )
     unit = time_unit or said
     t = column_of(table, name, "time=", {} if any_unit or unit else {"ms": "seconds"})
