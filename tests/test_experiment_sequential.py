@@ -345,6 +345,20 @@ def test_a_simulated_rig_has_the_effects_and_the_noise_that_are_asked_for():
         rf.SimulatedRig(dataclasses.replace(gated, gates=(*gated.gates[:-1], 0.5)), LIMITS, 0.01)
 
 
+def test_a_rig_that_records_in_degrees_or_other_channels_is_refused():
+    joint, noise = rf.joints.paper(), {"theta": 1e-3, "alpha": 1e-3}
+    models = {"smooth": joint, "rough": joint + rf.effects.Coulomb("hub", level=0.05)}
+    e = sequential_experiment(models, LIMITS, 0.01, noise=noise, improve=False).with_next_segment()
+    u = e.due
+    y = rf.simulate(joint, u, 0.01)
+    turned = rf.Recording(u=u, y=np.rad2deg(y), Ts=0.01, units=("deg", "deg"), accept=("units",))
+    with pytest.raises(InputError, match="in deg, but the output theta of the model is in rad"):
+        e.with_recording(turned)
+    other = rf.Recording(u=u, y=y, Ts=0.01, channels=("theta", "beta"), accept=("units",))
+    with pytest.raises(InputError, match="has the channels theta, beta, but the models theta, alpha; record"):
+        e.with_recording(other)
+
+
 def test_arguments_of_the_other_use_are_refused():
     joint, noise = rf.joints.paper(), {"theta": 1e-3, "alpha": 1e-3}
     with pytest.raises(InputError, match="`probabilities` is for several models"):

@@ -431,13 +431,13 @@ def _checked(recording: Any, due: np.ndarray, rivals: RivalSet) -> RunData:
                 f"The recording has a sampling period of {recording.Ts:g} s, but the experiment one of "
                 f"{rivals.Ts:g} s; record at that rate."
             )
-        if set(recording.channels) < set(channels):
+        if not set(channels) <= set(recording.channels):
             raise InputError(
                 f"The recording has the channels {', '.join(recording.channels)}, but the models "
                 f"{', '.join(channels)}; record these."
             )
         u = recording.u.astype(float)
-        y = np.column_stack([recording.channel(c).astype(float) for c in channels])
+        y = rivals.models[0].measured(recording).astype(float)
     else:
         y = np.asarray(recording)
         u = due
