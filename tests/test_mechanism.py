@@ -1,7 +1,8 @@
 """Mechanisms: refused arguments, adding and removing of effects, and no new program for other values."""
 
 import dataclasses
-from typing import ClassVar
+from collections.abc import Callable
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -119,6 +120,13 @@ def test_pytree_there_and_back():
     doubled = jax.tree.map(lambda x: 2 * x, joint)
     np.testing.assert_array_equal(doubled.values, 2 * joint.values)
     assert doubled.trusted == joint.trusted
+
+
+@pytest.mark.parametrize("use", [lambda joint: simulate(joint, noise(60), 0.01), linearise, Model])
+def test_traced_values_are_refused_where_numbers_are_needed(use: Callable[[Mechanism], Any]) -> None:
+    joint = paper()
+    with pytest.raises(InputError, match=r"values that JAX traces.* use rotflex_jax\.mechanism\.free_run"):
+        jax.jit(lambda joint: use(joint) and None)(joint)
 
 
 def last_deflection(joint: Mechanism) -> jax.Array:

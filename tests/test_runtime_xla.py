@@ -1,12 +1,39 @@
-"""Parallel calls on threads."""
+"""Precision and time of computations, and parallel calls on threads."""
 
 import threading
 import time
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rotflex_jax.runtime.xla import cores, on_threads
+from rotflex_jax.joints import paper
+from rotflex_jax.mechanism import simulate
+from rotflex_jax.models.model import Model
+from rotflex_jax.recording import Recording
+from rotflex_jax.runtime.xla import cores, double_precision, on_threads, working_precision
+
+
+@pytest.mark.parametrize("context", [double_precision, lambda: working_precision(np.ones(1))])
+def test_numbers_are_computed_at_once_and_precisely_inside_of_another_program(context) -> None:
+    def outer(x):
+        with context():
+            found = np.asarray(jnp.sqrt(jnp.asarray(2.0)))  # of an array that is still to come if traced
+        assert found == np.sqrt(2.0)
+        return jnp.asarray(x) + 1
+
+    assert jax.jit(outer)(1.0) == 2.0
+    assert jax.jit(outer)(1.0).dtype == np.float32
+
+
+def test_a_model_runs_inside_of_another_program() -> None:
+    u = np.sin(np.arange(200) / 10)
+    recording = Recording(u=u, y=simulate(paper(), u, 0.01), Ts=0.01)
+    model = Model(paper())
+    runs = []
+    jax.jit(lambda x: runs.append(model.simulate(recording)) or x)(1.0)
+    np.testing.assert_array_equal(runs[0], model.simulate(recording))
 
 
 def test_results_come_in_the_order_of_the_jobs():

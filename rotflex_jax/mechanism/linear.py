@@ -6,6 +6,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 import scipy
+from jax.core import Tracer
 from jaxtyping import Float
 
 from rotflex_jax.effects.base import Linear
@@ -17,7 +18,12 @@ from rotflex_jax.runtime.xla import double_precision
 
 
 def check_movable(mechanism: Mechanism) -> None:
-    """Raise `InputError` if a coordinate of a complete mechanism has no inertia."""
+    """Raise `InputError` if a coordinate of a complete mechanism has no inertia, or if JAX traces a value."""
+    if any(isinstance(value, Tracer) for e in mechanism.effects for value in e.values.values()):
+        raise InputError(
+            "The mechanism has parameter values that JAX traces, but numbers are needed here; inside of "
+            "jax.jit or jax.grad use rotflex_jax.mechanism.free_run, or give numbers."
+        )
     n = len(mechanism.coordinates)
     linear = [(e.stamp(), e.at) for _, e in effects_of(mechanism, Linear)]
     rows = [np.sqrt(abs(float(s.inertia))) * np.array(mechanism.port_vectors[at]) for s, at in linear]

@@ -8,7 +8,7 @@ import contextlib
 import functools
 import os
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import CancelledError, ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
@@ -148,20 +148,24 @@ def loops_are_fast() -> bool:
 
 
 def working_precision(*arrays: Num[np.ndarray, "..."]) -> contextlib.AbstractContextManager:
-    """Context in which JAX keeps float64 if any of `arrays` is float64.
+    """Context in which JAX computes at once, and keeps float64 if any of `arrays` is float64.
 
     Outside of it the JAX configuration of the user is not changed.
     """
-    start_with_fast_loops()
-    if any(np.asarray(a).dtype == np.float64 for a in arrays):
-        return jax.enable_x64(True)
-    return contextlib.nullcontext()
+    return _at_once(any(np.asarray(a).dtype == np.float64 for a in arrays))
 
 
 def double_precision() -> contextlib.AbstractContextManager:
-    """Context in which JAX computes in float64, as fits and discovery need."""
+    """Context in which JAX computes at once and in float64, as fits and discovery need."""
+    return _at_once(True)
+
+
+@contextlib.contextmanager
+def _at_once(double: bool) -> Iterator[None]:
+    """Context in which JAX computes numbers, also while it traces a function of the user."""
     start_with_fast_loops()
-    return jax.enable_x64(True)
+    with jax.core.eval_context(), jax.enable_x64(True) if double else contextlib.nullcontext():
+        yield
 
 
 Parameters = ParamSpec("Parameters")
