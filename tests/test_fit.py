@@ -287,6 +287,37 @@ def test_what_cannot_be_fitted_is_refused():
         fit(joint, Recording(u=rec.u, y=rec.y, Ts=rec.Ts, channels=("a", "b")))
 
 
+def test_effects_that_are_switched_off_are_left_out():
+    rec, truth = record(3, effects=(), seconds=1.0)
+    joint = off(truth, friction=False).mechanism
+    large = joint + fx.Coulomb("hub") + fx.Spring("hub", stiffness=1.0)
+    model = Model(large.trust("hub.spring.stiffness"), SOLVER, [1] * 6 + [0, 0])
+    for process_noise in (None, {"hub": 1e-7}):
+        found, expected = (
+            fit(m, rec, process_noise=process_noise, restarts=0) for m in (model, Model(joint, SOLVER))
+        )
+        assert found.model == expected.model and found.cost == expected.cost
+    with pytest.raises(InputError, match=r"gates \(1\.0, .* 0\.5\), .* give 1 or 0"):
+        fit(dataclasses.replace(model, gates=(*[1.0] * 7, 0.5)), rec)
+
+
+def test_effects_that_are_switched_off_do_not_change_a_prediction():
+    rec, _ = record(3, effects=(), seconds=1.0)
+    large = paper() + fx.Coulomb("hub") + fx.Spring("hub", stiffness=1.0)
+    found, expected = (
+        model.predict(rec, {"hub": 1e-4}, [1e-3, 1e-3])
+        for model in (Model(large, gates=np.r_[np.ones(6), 0, 0]), Model(paper()))
+    )
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-10)
+
+
+def test_gates_may_be_given_in_any_sequence(tmp_path):
+    model = Model(paper(), gates=np.array([1, 1, 1, 1, 1, 0]))
+    assert model == Model(paper(), gates=(1.0, 1.0, 1.0, 1.0, 1.0, 0.0))
+    assert hash(model) == hash(Model(paper(), gates=[True] * 5 + [False]))
+    assert Model.load(model.save(tmp_path / "model.json")) == model
+
+
 def test_asking_for_a_parameter_that_is_not_there(recovered):
     with pytest.raises(InputError, match=r"hub\.coulomb\.level"):
         recovered[0][0]["hub.coulomb.height"]

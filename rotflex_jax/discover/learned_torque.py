@@ -197,7 +197,7 @@ def learn_torque(
             already has a learned torque there.
     """
     clear_compilation_caches()
-    model, say = Model.of(model), checks.progress(progress)
+    model, say = Model.of(model).without_gates(), checks.progress(progress)
     trained = listed(train, "train", SHORTEST_TO_FIT)
     held_back = listed(validation, "validation", SHORTEST_TO_FIT)
     checks.positive(window_seconds, "window_seconds")

@@ -116,7 +116,7 @@ def discover(
     """
     started, say = time.perf_counter(), checks.progress(progress)
     clear_compilation_caches()
-    model, rounds = Model.of(mechanism), checks.whole(rounds, "rounds", 0)
+    model, rounds = Model.of(mechanism).without_gates(), checks.whole(rounds, "rounds", 0)
     checks.positive(window_seconds, "window_seconds")
     checks.number(calibrate_seconds, "calibrate_seconds", least=0, unit="s", example="2.0")
     # 1. Prepare: one super-model with every candidate built in, the recordings at both horizons.

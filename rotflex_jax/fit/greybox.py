@@ -172,7 +172,8 @@ def fit(
     with them, `remarks` names the settings to use. The fit itself keeps its steps.
 
     Args:
-        mechanism: Mechanism to fit; its values are the start, and its trusted parameters are held.
+        mechanism: Mechanism to fit; its values are the start, and its trusted parameters are held. Effects
+            that the gates of a model switch off are left out.
         recordings: One or several recordings. Parameters are common, and each recording has its own first
             state.
         process_noise: Port -> intensity of the process noise [(N m)^2 s]; None for a free run.
@@ -206,7 +207,7 @@ def fit(
             against the model.
         RuntimeError: If the fit failed and `throw` is set.
     """
-    model = Model.of(mechanism)
+    model = Model.of(mechanism).without_gates()
     given = list(listed(recordings, shortest=SHORTEST_TO_FIT))
     m, say = model.mechanism, checks.progress(progress)
     names = m.parameter_names

@@ -239,7 +239,7 @@ def identifiable(mechanism: Mechanism | Model | Fit, recording: Recording | None
     (sloppy directions).
     """
     fitted = mechanism if isinstance(mechanism, Fit) else None
-    model = fitted.model if fitted else Model.of(mechanism)  # type: ignore[arg-type]
+    model = fitted.model if fitted else Model.of(mechanism).without_gates()  # type: ignore[arg-type]
     if recording is not None:
         recording = single(recording, "recording", shortest=SHORTEST_TO_FIT)
         model = model.at(recording)

@@ -283,7 +283,7 @@ def many_starts(
         InputError: If there is nothing to fit, if arguments are out of their range, if a channel moves
             against the model, or if no start has a finite error.
     """
-    model, say = Model.of(mechanism), checks.progress(progress)
+    model, say = Model.of(mechanism).without_gates(), checks.progress(progress)
     given = list(listed(recordings, shortest=SHORTEST_TO_FIT))
     m, seed = model.mechanism, checks.whole(seed, "seed", 0, math.inf)
     if not m.free_names:

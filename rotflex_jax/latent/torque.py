@@ -138,7 +138,12 @@ def _predicted_trajectory(model: Model, augmented: Mechanism, dataset: Dataset) 
     x0 = np.tile(rest_state(m.structure, np.float64), (len(first), 1))
     x0[:, : first.shape[1]] = first
     process_noise = process_noise_ports(m, (0.03 * dataset.torque_scale) ** 2)
-    K = np.stack([kalman_gains(m, [process_noise], dataset.noise, float(Ts))[0] for Ts in dataset.data.Ts])
+    K = np.stack(
+        [
+            kalman_gains(m, [process_noise], dataset.noise, float(Ts), model._switches())[0]
+            for Ts in dataset.data.Ts
+        ]
+    )
     count = len(augmented.effects) - len(m.effects)
     switches = np.r_[model._switches(), np.ones(count)]
     arrays = jax.tree.map(jnp.asarray, (augmented.values, switches, x0, dataset.data, K))

@@ -113,10 +113,12 @@ def _equations(structure: Mechanism, values: jax.Array, gates: jax.Array) -> tup
     return tuple(equations(structure.with_values(values), gates))
 
 
-def _linear_part(mechanism: Mechanism) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """`A`, `B` and the inverse mass matrix."""
+def _linear_part(
+    mechanism: Mechanism, gates: Float[np.ndarray, " E"] | None = None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """`A`, `B` and the inverse mass matrix; with all effects on if `gates` is None."""
     with double_precision():
-        gates = np.ones(len(mechanism.effects))
+        gates = np.ones(len(mechanism.effects)) if gates is None else gates
         eq = EquationsOfMotion(*_equations(mechanism.structure, mechanism.values, gates))
         return np.asarray(eq.A), np.asarray(eq.B), np.asarray(eq.inverse_mass)
 
@@ -134,12 +136,14 @@ def linearise(mechanism: Mechanism) -> StateSpace:
     return _linearised(mechanism)[0]
 
 
-def _linearised(mechanism: Mechanism) -> tuple[StateSpace, np.ndarray]:
+def _linearised(
+    mechanism: Mechanism, gates: Float[np.ndarray, " E"] | None = None
+) -> tuple[StateSpace, np.ndarray]:
     """State-space model of the linear effects, and the inverse of the mass matrix."""
     check_mechanism(mechanism)
     check_movable(mechanism)
     layout = Layout.of(mechanism.structure)
-    A, B, Minv = _linear_part(mechanism)
+    A, B, Minv = _linear_part(mechanism, gates)
     C = np.zeros((len(mechanism.channels), layout.linear))
     C[:, : 2 * layout.n] = layout.output_rows
     return StateSpace(A, B, C), Minv
@@ -150,6 +154,7 @@ def kalman_gains(
     intensities: Sequence[Mapping[str, float]],
     noise: Float[np.ndarray, " C"] | Sequence[float],
     Ts: float,
+    gates: Float[np.ndarray, " E"] | None = None,
 ) -> Float[np.ndarray, "Q n C"]:
     """Steady Kalman gains of the linear part under process noise (white torques) at some ports.
 
@@ -166,11 +171,12 @@ def kalman_gains(
             gain.
         noise: Standard deviation of the sensor noise of each channel.
         Ts: Sampling period [s].
+        gates: Factor of each effect, 0 where it is switched off; None for all on.
 
     Returns:
         One gain for each of the `intensities`, with zero rows for the states of memories.
     """
-    layout, (ss, Minv) = Layout.of(mechanism.structure), _linearised(mechanism)
+    layout, (ss, Minv) = Layout.of(mechanism.structure), _linearised(mechanism, gates)
     n, size = layout.n, layout.linear
     names, vectors = zip(*mechanism.ports, strict=True)
     covariances = process_covariance(ss.A, np.array(vectors) @ Minv.T, n, Ts)

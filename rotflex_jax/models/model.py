@@ -84,7 +84,8 @@ class Model:
             )
         if self.gates is not None:
             count = len(self.mechanism.effects)
-            vector(self.gates, "gates", count, example=f"{[1] * count}, 1 for what is on")
+            gates = vector(self.gates, "gates", count, example=f"{[1] * count}, 1 for what is on")
+            object.__setattr__(self, "gates", tuple(gates.tolist()))  # a tuple, so that a model is hashable
         check_movable(self.mechanism)
         self._check_switched()
 
@@ -116,21 +117,24 @@ class Model:
         return dataclasses.replace(self, mechanism=self.mechanism + effect, gates=gates)
 
     def without_gates(self) -> "Model":
-        """The model without the effects that its gates switch off.
+        """The model without the effects that its gates switch off, and without gates.
 
         Raises:
             InputError: A gate is neither 0 nor 1.
         """
         if self.gates is None:
             return self
-        if any(g not in (0.0, 1.0) for g in self.gates):
+        if any(gate not in (0.0, 1.0) for gate in self.gates):
             raise InputError(
-                f"The gates of the model are {', '.join(f'{g:g}' for g in self.gates)}, but only effects "
-                "that are on or off are taken here; give 1 or 0 for each."
+                f"The model has the gates {self.gates}, but here an effect is on or off; give 1 or 0 for "
+                "each."
             )
         m = self.mechanism
-        for e, gate in zip(m.effects, self.gates, strict=True):
-            m = m if gate else m.without(e.name, e.at)
+        on = tuple(e for e, gate in zip(m.effects, self.gates, strict=True) if gate)
+        names = {e.full_name(parameter) for e in on for parameter in e.values}
+        gone = {e.signal for e in m.effects} - {e.signal for e in on}
+        signals = tuple(s for s in m.signals if s not in gone)
+        m = dataclasses.replace(m, effects=on, trusted=m.trusted & names, signals=signals)
         return dataclasses.replace(self, mechanism=m, gates=None)
 
     def save(self, path: str | Path) -> Path:
@@ -375,7 +379,7 @@ class Model:
                 f"{shown(noise)} of shape {np.shape(noise)}; give their standard deviations."
             )
         noise = [number(x, "noise", above=0, example="[5e-4, 5e-4]") for x in noise]
-        K = kalman_gains(here.mechanism, [process_noise], noise, recording.Ts)[0]
+        K = kalman_gains(here.mechanism, [process_noise], noise, recording.Ts, self._switches())[0]
         x0 = self._start(recording)
         with double_precision():
             run = _predict(

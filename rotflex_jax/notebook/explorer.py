@@ -280,13 +280,8 @@ class Explorer:
     def refit(self) -> None:
         """Fits the free parameters of all effects that are on; sliders then multiply the fitted values."""
         on = self._stands()
-        gates = on.gates or ()
-        mechanism = on.mechanism
-        for e, gate in zip(on.mechanism.effects, gates, strict=True):
-            if not gate:
-                mechanism = mechanism.without(e.name, e.at)
         how = {"window_seconds": self._seconds, "progress": self._meanwhile}
-        fitted = fit(Model(mechanism, **self._solver), self._train, **how)
+        fitted = fit(on, self._train, **how)
         self._remember()
         self._base, self._factors = on.mechanism.with_values(fitted.model.mechanism.named_values), {}
         self._said = f"refitted: {fitted.ending}"
