@@ -107,7 +107,11 @@ FUNCTIONS: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     "Recording.decimate": (RUN.decimate, {"k": 2}),
     "Recording.slice": (RUN.slice, {"i": 0, "j": 60}),
     "Model.simulate": (MODEL.simulate, {"recording": RUN}),
+    "Model.simulate_states": (MODEL.simulate_states, {"recording": RUN}),
     "Model.simulate_windows": (MODEL.simulate_windows, {"recording": RUN}),
+    "Model.behind_actuation": (MODEL.behind_actuation, {"recording": RUN}),
+    "Model.inputs": (MODEL.inputs, {"recording": RUN}),
+    "Model.at": (MODEL.at, {"recording": RUN}),
     "Model.predict": (
         MODEL.predict,
         {"recording": RUN, "process_noise": {"hub": 1e-6}, "noise": [1e-3, 1e-3]},
@@ -535,7 +539,11 @@ BAD: dict[tuple[str, str], list[tuple[Any, str]]] = {
     ],
     ("Model.simulate", "recording"): NO_RECORDINGS,
     ("Model.simulate", "x0"): [(np.zeros(9), "9 entries"), ([NAN], "is nan"), ("a", "`x0` must be")],
+    ("Model.simulate_states", "recording"): NO_RECORDINGS[:3],
     ("Model.simulate_windows", "recording"): NO_RECORDINGS[:3],
+    ("Model.behind_actuation", "recording"): NO_RECORDINGS[:3],
+    ("Model.inputs", "recording"): NO_RECORDINGS[:3],
+    ("Model.at", "recording"): NO_RECORDINGS[:3],
     ("Model.simulate_windows", "seconds"): NO_SECONDS,
     ("Model.predict", "recording"): NO_RECORDINGS[:3],
     ("Model.predict", "process_noise"): PROCESS_NOISE,
@@ -550,6 +558,7 @@ BAD: dict[tuple[str, str], list[tuple[Any, str]]] = {
     ("Mechanism.with_values", "values"): [
         ([1.0], "one number for each of the 1[0-9] parameters, but is a list"),
         (np.ones(99), "one number for each"),
+        (np.ones((len(JOINT.values), 2)), "is an? ndarray"),
         (None, "is None"),
         ({"x": 1.0}, "'x' was named"),
         ({"hub.inertia.inertia": NAN}, "finite value"),
@@ -710,6 +719,17 @@ def test_every_public_function_is_in_the_table() -> None:
     inputs = set(excitation.INPUTS)
     assert functions | inputs <= {function for function, _ in BAD}
     assert {function for function, _ in BAD} == set(FUNCTIONS)
+
+
+def test_a_list_of_one_recording_is_this_recording() -> None:
+    noise = {"hub": 1e-6}, [1e-3, 1e-3]
+    for run in (
+        MODEL.simulate,
+        MODEL.simulate_states,
+        MODEL.simulate_windows,
+        lambda recording: MODEL.predict(recording, *noise),
+    ):
+        np.testing.assert_array_equal(run([RUN]), run(RUN))
 
 
 def test_whole_numbers_may_be_floats() -> None:

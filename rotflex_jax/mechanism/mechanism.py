@@ -432,6 +432,7 @@ class Mechanism:
                     self._refuse_follower(name)
             values = list((old | dict(values)).values())
         sized = hasattr(values, "__len__") and getattr(values, "ndim", 1) > 0
+        sized = sized and not (isinstance(values, np.ndarray) and values.ndim > 1)
         if not sized or len(values) != len(self.parameter_names):
             raise InputError(
                 f"Argument `values` must have one number for each of the {len(self.parameter_names)} "

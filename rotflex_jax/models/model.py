@@ -162,6 +162,7 @@ class Model:
         Raises:
             InputError: A constant belongs to an effect of the model, but the effect has no such parameter.
         """
+        recording = single(recording)
         names, effects = self.mechanism.parameter_names, {(e.at, e.name) for e in self.mechanism.effects}
         for name in recording.constants:
             head, _, parameter = name.rpartition(".")
@@ -176,7 +177,7 @@ class Model:
 
     def measured(self, recording: Recording) -> Float[np.ndarray, "N C"]:
         """The channels of a recording that are outputs of the mechanism, in the order of the outputs."""
-        recording = single(recording, "recording")
+        recording = single(recording)
         missing = [c for c in self.mechanism.channels if c not in recording.channels]
         if missing:
             raise InputError(
@@ -200,7 +201,7 @@ class Model:
         Raises:
             InputError: The recording lacks one of these signals.
         """
-        names = self.mechanism.signals
+        recording, names = single(recording), self.mechanism.signals
         if missing := [name for name in names if name not in recording.signals]:
             has = ", ".join(map(repr, recording.signals)) or "none"
             raise InputError(
@@ -234,6 +235,7 @@ class Model:
 
         In a part of that recording, a delay, lag or drift does not start again.
         """
+        recording = single(recording)
         v, inner = self._behind_actuation(recording)
         return inner, dataclasses.replace(recording, u=v if v.ndim == 1 else v[:, 0], accept=ACCEPTABLE)
 
@@ -280,7 +282,7 @@ class Model:
             recording: Its voltage drives the model.
             x0: First positions and speeds, if they are known.
         """
-        recording = single(recording, "recording")
+        recording = single(recording)
         if x0 is None:
             return self._run(recording, self._start(recording))[1]
         start = first_state(rest_state(self.mechanism.structure, np.float64), x0)
@@ -288,6 +290,7 @@ class Model:
 
     def simulate_states(self, recording: Recording) -> Float[np.ndarray, "N n"]:
         """States of the free run of `simulate`: positions, speeds, then states of effects."""
+        recording = single(recording)
         return self._run(recording, self._start(recording))[0]
 
     def simulate_windows(self, recording: Recording, seconds: float = 2.0) -> Float[np.ndarray, "N C"]:
@@ -302,6 +305,7 @@ class Model:
             recording: Its voltage drives the model.
             seconds: Length of a window [s]; a remainder of up to twice `n_init` belongs to the last window.
         """
+        recording = single(recording)
         y = self.measured(recording).astype(float)
         u, inner = self._behind_actuation(recording)
         starts, length = window_starts(recording, seconds)
@@ -367,6 +371,7 @@ class Model:
             process_noise: Port -> intensity of the process noise [(N m)^2 s].
             noise: Standard deviation of the sensor noise of each channel.
         """
+        recording = single(recording)
         y, m = self.measured(recording).astype(float), self.mechanism
         u, here, process_noise = (
             self.inputs(recording),
