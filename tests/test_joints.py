@@ -265,3 +265,11 @@ def test_a_type_error_within_a_function_is_no_wrong_argument() -> None:
     with pytest.raises(TypeError) as failed:
         known_arguments(lambda: len(3))()  # type: ignore[arg-type]
     assert not isinstance(failed.value, InputError)
+
+
+@pytest.mark.parametrize("preset", [joints.flexible_link, joints.xl330_pendulum])
+def test_a_preset_passes_through_a_gradient(preset) -> None:
+    """Everything in these two is linear in the mass."""
+    slope = jax.jit(jax.grad(lambda mass: sum(jax.tree.leaves(preset(mass=mass)))))(0.2)
+    low, high = (preset(mass=mass).values.sum() for mass in (0.2, 0.3))
+    assert float(slope) == pytest.approx((high - low) / 0.1, rel=1e-4)

@@ -158,6 +158,14 @@ FUNCTIONS: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     "joints.paper": (joints.paper, {}),
     "joints.quanser_2010": (joints.quanser_2010, {}),
     "joints.servo": (joints.servo, {}),
+    "joints.flexible_joint": (
+        joints.flexible_joint,
+        {"hub_inertia": 0.002, "arm_inertia": 0.006, "stiffness": 1.6, "motor": rf.effects.Motor("hub")},
+    ),
+    "joints.flexible_link": (joints.flexible_link, {}),
+    "joints.single_inertia": (joints.single_inertia, {}),
+    "joints.position_servo": (joints.position_servo, {}),
+    "joints.xl330_pendulum": (joints.xl330_pendulum, {}),
     "LoadFriction": (rf.effects.LoadFriction, {"at": "hub"}),
     "noise": (excitation.noise, {"N": 100, "Ts": 0.01}),
     "multisine": (excitation.multisine, {"N": 100, "Ts": 0.01}),
@@ -687,6 +695,18 @@ BAD: dict[tuple[str, str], list[tuple[Any, str]]] = {
     ("joints.quanser_2010", "arm"): [([], "given a list"), (4, "given 4")],
     ("joints.quanser_2010", "spring"): [([], "given a list"), ("x", "given 'x'")],
     ("joints.quanser_2010", "sensors"): [(["x"], "but is 'x'")],
+    ("joints.flexible_joint", "motor"): [(None, "must be a Motor, but is None"), (3, "is 3")],
+    **{
+        ("joints.flexible_link", name): [*NO_NUMBER, (-1.0, "is -1")]
+        for name in ("mass", "length", "frequency", "damping_ratio", "gauge_gain")
+    },
+    ("joints.flexible_link", "hub"): [("a", "'a'"), (-1.0, "is -1")],
+    ("joints.flexible_link", "motor"): [("x", "must be a Motor, but is 'x'")],
+    ("joints.single_inertia", "motor"): [("x", "must be a Motor, but is 'x'")],
+    ("joints.position_servo", "servo"): [("x", "must be a PositionLoop, but is 'x'; give .*PositionServo")],
+    ("joints.xl330_pendulum", "mass"): NO_NUMBER,
+    ("joints.xl330_pendulum", "length"): NO_NUMBER,
+    ("joints.xl330_pendulum", "rotor_inertia"): NO_NUMBER,
     ("pulse", "delay"): [(NAN, "is nan"), (-1, "is -1")],
 }
 
@@ -719,6 +739,11 @@ def test_every_public_function_is_in_the_table() -> None:
     inputs = set(excitation.INPUTS)
     assert functions | inputs <= {function for function, _ in BAD}
     assert {function for function, _ in BAD} == set(FUNCTIONS)
+
+
+def test_settings_of_the_kit_may_be_numbers_of_numpy() -> None:
+    given = joints.quanser_2010(np.int64(1), spring=np.int32(3), hub_anchor=np.str_("A"))
+    assert given == joints.quanser_2010(1, spring=3, hub_anchor="A")
 
 
 def test_a_list_of_one_recording_is_this_recording() -> None:

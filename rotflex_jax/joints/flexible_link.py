@@ -8,8 +8,9 @@ curvature of the beam at the clamp is `4 / L` times the sum of these angles, wha
 
 import math
 
-from rotflex_jax.checks import known_arguments
+from rotflex_jax.checks import instance, known_arguments
 from rotflex_jax.effects import Inertia, Motor, SensorGain, Spring, Viscous
+from rotflex_jax.joints.arguments import known_number
 from rotflex_jax.joints.rotary_flexible import hub_inertia, srv02_motor
 from rotflex_jax.mechanism import Mechanism
 
@@ -67,6 +68,10 @@ def flexible_link(
     Returns:
         Mechanism with the outputs `theta` and `alpha`.
 
+    Raises:
+        InputError: A mass, a length, a frequency or the gain of the gauge is no positive number, a damping
+            ratio is negative, or the motor is none.
+
     Source: L. Meirovitch, Fundamentals of Vibrations, 2001, section 8.3 (clamped beam); Quanser, Rotary
         Flexible Link, user manual, 2011 (mass, length, calibration of the gauge). The frequency is typical of
         that link.
@@ -75,6 +80,15 @@ def flexible_link(
     >>> link.channels, "alpha.sensor_gain.error" in link.free_names
     (('theta', 'alpha'), True)
     """
+    mass = known_number(mass, "mass", above=0, unit="kg", example="0.065")
+    length = known_number(length, "length", above=0, unit="m", example="0.419")
+    frequency = known_number(frequency, "frequency", above=0, unit="Hz", example="3.0")
+    damping_ratio = known_number(damping_ratio, "damping_ratio", least=0, example="0.01")
+    gauge_gain = known_number(gauge_gain, "gauge_gain", above=0, example="4 / 3")
+    if hub is not None:
+        hub = known_number(hub, "hub", least=0, unit="kg m^2", example="0.002")
+    if motor is not None:
+        instance(motor, Motor, "motor", "give rotflex_jax.effects.Motor('hub', ...)")
     whole = mass * length**2 / 3
     inertias = [share * whole for share in SHARES]
     angular = [2 * math.pi * frequency * (b / WAVE_NUMBERS[0]) ** 2 for b in WAVE_NUMBERS]

@@ -4,7 +4,7 @@ import dataclasses
 import math
 from types import MappingProxyType
 
-from rotflex_jax.checks import known_arguments
+from rotflex_jax.checks import instance, known_arguments
 from rotflex_jax.effects import CurrentDrive, Inertia, MeasuredDisturbance, Motor, Spring, Viscous
 from rotflex_jax.effects.base import Effect, driven_place
 from rotflex_jax.errors import InputError
@@ -47,6 +47,8 @@ def single_inertia(
     >>> axis.free_names
     ('axis.inertia.inertia', 'axis.viscous.coefficient')
     """
+    if motor is not None:
+        instance(motor, Motor, "motor", "give rotflex_jax.effects.Motor('hub', ...)")
     motor = dataclasses.replace(motor or Motor(), at=port)
     return Mechanism(
         coordinates=(channel,),

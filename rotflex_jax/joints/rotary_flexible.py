@@ -16,9 +16,10 @@ import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from rotflex_jax.checks import known_arguments, names, shown
+from rotflex_jax.checks import instance, known_arguments, names, shown
 from rotflex_jax.effects import Inertia, Motor, Spring, Viscous
 from rotflex_jax.errors import InputError
+from rotflex_jax.joints.arguments import plain
 from rotflex_jax.mechanism import Mechanism
 
 INCH = 0.0254
@@ -82,6 +83,7 @@ def spring_stiffness(
     >>> round(spring_stiffness(2, "B", 2), 4)
     1.2485
     """
+    spring, hub_anchor, arm_anchor = map(plain, (spring, hub_anchor, arm_anchor))
     for what, value, known in (
         ("spring", spring, SPRINGS),
         ("hub_anchor", hub_anchor, HUB_ANCHORS),
@@ -171,6 +173,7 @@ def flexible_joint(
     Source: Lagrange's equations; Quanser, Rotary Flexible Joint workbook, 2011.
     """
     measured = _measured(sensors)
+    instance(motor, Motor, "motor", "give rotflex_jax.effects.Motor('hub', ...)")
     held = [name for name in motor.values if name != "torque_constant"]
     return Mechanism(
         coordinates=("theta", "alpha"),
@@ -345,6 +348,7 @@ def arm_inertia(arm: int = 2) -> float:
     0.0038938
     """
     centres = {0: None, 1: 9 * INCH, 2: 10 * INCH, 3: 11 * INCH}
+    arm = plain(arm)
     if not isinstance(arm, int) or arm not in centres:
         raise InputError(
             f"arm was given {shown(arm)}, but the short arm sits at 1, 2 or 3, or is left off (0); "

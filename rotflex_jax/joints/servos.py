@@ -3,7 +3,7 @@
 import dataclasses
 from typing import Literal, get_args
 
-from rotflex_jax.checks import known_arguments, number, one_of
+from rotflex_jax.checks import instance, known_arguments, number, one_of
 from rotflex_jax.effects import (
     CurrentMeter,
     DutyMeter,
@@ -15,6 +15,7 @@ from rotflex_jax.effects import (
 )
 from rotflex_jax.effects.base import Memory
 from rotflex_jax.effects.motor import DYNAMIXEL_GAIN_SCALE
+from rotflex_jax.joints.arguments import known_number
 from rotflex_jax.mechanism import Mechanism
 from rotflex_jax.mechanism.quantity import Units
 
@@ -66,6 +67,8 @@ def position_servo(
     >>> position_servo().free_names[:2]
     ('hub.position_servo.torque_constant', 'hub.position_servo.resistance')
     """
+    if servo is not None:
+        instance(servo, PositionLoop, "servo", "give rotflex_jax.effects.PositionServo('hub', ...)")
     driven = dataclasses.replace(servo or PositionServo(), at="hub")
     return Mechanism(
         coordinates=("theta",),
@@ -110,6 +113,9 @@ def xl330_pendulum(
     >>> xl330_pendulum().free_names[:3]
     ('hub.inertia.inertia', 'hub.position_servo.torque_constant', 'hub.position_servo.resistance')
     """
+    mass = known_number(mass, "mass", above=0, unit="kg", example="0.49")
+    length = known_number(length, "length", above=0, unit="m", example="0.1")
+    rotor_inertia = known_number(rotor_inertia, "rotor_inertia", least=0, unit="kg m^2", example="0.002")
     return (
         position_servo(
             mass * length**2 + rotor_inertia,
