@@ -16,6 +16,7 @@ from rotflex_jax.mechanism import Exponential, Mechanism, SmoothRK4
 from rotflex_jax.mechanism.quantity import Units
 from rotflex_jax.models.model import Model
 from rotflex_jax.recording import Recording
+from rotflex_jax.runtime.persistent_jit import static_key
 
 AWKWARD = (0.1 + 0.2, 1 / 3, np.pi * 1e-9, 5e-324, 1.7976931348623157e308)
 
@@ -76,6 +77,19 @@ def recording(model: Model, N: int = 600) -> Recording:
     u = np.cumsum(rng.normal(size=N)) / 4
     y = rf.simulate(model.mechanism, u, 0.004) + 1e-4 * rng.normal(size=(N, 2))
     return Recording(u=u, y=y, Ts=0.004)
+
+
+@pytest.mark.parametrize(
+    "solver",
+    [
+        Exponential(order=np.int64(4), substeps=np.int64(2), passes=2.0),
+        SmoothRK4(np.float32(0.5), np.int32(3)),
+    ],
+)
+def test_a_solver_with_numbers_of_numpy_comes_back(tmp_path, solver):
+    model = Model(paper(), solver)
+    assert reloaded(model, tmp_path) == model
+    assert static_key(solver)
 
 
 def test_a_fit_is_saved_with_its_estimates_and_simulates_the_same(tmp_path):

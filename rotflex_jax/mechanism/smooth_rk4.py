@@ -62,8 +62,9 @@ class SmoothRK4:
     substeps: int = 20
 
     def __post_init__(self) -> None:
-        positive(self.width, "width", "rad/s", "0.02")
-        whole(self.substeps, "substeps", 1)
+        # As Python's numbers, which a model file and the key of a program can hold.
+        object.__setattr__(self, "width", positive(self.width, "width", "rad/s", "0.02"))
+        object.__setattr__(self, "substeps", whole(self.substeps, "substeps", 1))
 
     def inputs(self, v: Float[Array, " N"]) -> Float[Array, " N"]:
         """Input of `advance` at each sample, for a sequence of voltages."""

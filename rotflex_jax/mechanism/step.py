@@ -466,9 +466,11 @@ class Exponential:
             raise InputError(
                 f"Argument `order` must be 2 or 4, but is {shown(self.order)}; give one of these."
             )
-        whole(self.substeps, "substeps", 1)
+        # As Python's numbers, which a model file and the key of a program can hold.
+        object.__setattr__(self, "order", int(self.order))
+        object.__setattr__(self, "substeps", whole(self.substeps, "substeps", 1))
         if self.passes is not None:
-            whole(self.passes, "passes", 1)
+            object.__setattr__(self, "passes", whole(self.passes, "passes", 1))
         one_of(self.between, "between", get_args(Intersample))
         if self.between == "switched" and self.substeps > 1:
             raise InputError('between="switched" needs one step per sample; leave out `substeps`.')

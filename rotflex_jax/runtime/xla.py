@@ -16,6 +16,7 @@ from typing import Any, ParamSpec, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import eval_context
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Num
 from threadpoolctl import ThreadpoolController
@@ -164,7 +165,7 @@ def double_precision() -> contextlib.AbstractContextManager:
 def _at_once(double: bool) -> Iterator[None]:
     """Context in which JAX computes numbers, also while it traces a function of the user."""
     start_with_fast_loops()
-    with jax.core.eval_context(), jax.enable_x64(True) if double else contextlib.nullcontext():
+    with eval_context(), jax.enable_x64(True) if double else contextlib.nullcontext():
         yield
 
 
