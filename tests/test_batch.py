@@ -1,6 +1,7 @@
 """Searches of many recordings: each gives a row, none is lost, and none is repeated without need."""
 
 import csv
+import dataclasses
 import functools
 import html
 import json
@@ -173,6 +174,13 @@ def test_what_is_wrong_with_one_recording_is_a_row_of_the_page(files, tmp_path) 
     assert all(r.reason in text for r in found.failed)
     # Refused data are not tried again; a recording with another error is.
     assert [r.known for r in call().rows] == [True, True, True, False]
+
+
+def test_a_name_that_is_made_collides_with_none_that_is_given(files) -> None:
+    given = [rf.load(file) for file in files[:3]]
+    named = zip(given, ("run.csv", "run.csv", "run-1.csv"), strict=True)
+    named = [dataclasses.replace(r, source=name) for r, name in named]
+    assert storage.names_of(named) == ["run-1_", "run-2", "run-1"]
 
 
 def test_names_that_collide_get_files_of_their_own(tmp_path) -> None:

@@ -8,7 +8,7 @@ import math
 import os
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -79,9 +79,16 @@ def names_of(sources: Sequence[Path | Recording]) -> list[str]:
     plain = ["".join(c if c.isalnum() or c in "-_.+" else "_" for c in name) for name in plain]
     count = Counter(plain)
     return [
-        name if count[name] == 1 else f"{name}-{_short(source, number)}"
+        name if count[name] == 1 else _apart(f"{name}-{_short(source, number)}", count)
         for number, (name, source) in enumerate(zip(plain, sources, strict=True), 1)
     ]
+
+
+def _apart(name: str, taken: Container[str]) -> str:
+    """The name, with underscores at its end until it differs from names that are taken."""
+    while name in taken:
+        name += "_"
+    return name
 
 
 def _short(source: Path | Recording, number: int) -> str:
