@@ -5,8 +5,8 @@ The recordings come from a separate simulator, in which friction really sticks.
 
 import dataclasses
 from collections.abc import Mapping
-from types import MappingProxyType
-from typing import NamedTuple
+from types import MappingProxyType, SimpleNamespace
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -16,7 +16,8 @@ import rotflex_jax as rf
 import rotflex_jax.effects as fx
 from rotflex_jax.arena.simulator.records import make_record
 from rotflex_jax.discover.checkpoint import kept, restored
-from rotflex_jax.discover.friction_of_runs import Refits, refit_with_own_friction
+from rotflex_jax.discover.explanation import Explanation
+from rotflex_jax.discover.friction_of_runs import Refits, own_friction_notes, refit_with_own_friction
 from rotflex_jax.discover.hypothesis import (
     CandidateStart,
     Hypothesis,
@@ -28,12 +29,14 @@ from rotflex_jax.discover.hypothesis import (
     without,
 )
 from rotflex_jax.discover.likelihood import LikelihoodProblem, refit
-from rotflex_jax.discover.stepwise import fit_baseline, refit_candidates
+from rotflex_jax.discover.stepwise import calibration_notes, fit_baseline, refit_candidates
 from rotflex_jax.discover.supermodel import EffectLocation
 from rotflex_jax.discover.tables import error_lists
 from rotflex_jax.discover.validation import Horizons, adapted_to_recordings, as_free_run, carried_over
+from rotflex_jax.discover.verdict import Verdict
 from rotflex_jax.models.model import Model
 from rotflex_jax.recording import Recording
+from rotflex_jax.report.figures.runs import _over_time
 
 COULOMB, LUGRE, STRIBECK = (EffectLocation(name, "hub") for name in ("coulomb", "lugre", "stribeck"))
 WANTED = [(fx.Coulomb, "hub"), (fx.LuGre, "hub"), (fx.Stribeck, "hub")]
@@ -226,6 +229,45 @@ def test_the_friction_of_a_validation_run_is_said_to_be_fitted(between_runs: tup
     tables = {e.title: e.note for e in error_lists(found)}
     assert "was fitted to those of a run that was not trained" in tables["Validation data"]
     assert "was fitted" not in tables["Test data"]
+
+
+def test_what_a_model_lacks_is_asked_with_the_friction_of_the_run(
+    between_runs: tuple[rf.Discovery, Recording],
+):
+    """With the friction of one run, the model would lack a torque over the other run, and be taught one."""
+    found, _ = between_runs
+    latent = found.latent_torque()
+    assert latent.after is not None and len(latent.after.Ts) == 1
+    assert latent.sentences[0].endswith("the final model nothing that could be seen.")
+    for asked in (found.learned_torque, lambda: found.explanation(learned=True)):
+        with pytest.raises(rf.InputError, match=f"The runs differ in {LEVEL}, but a torque is"):
+            asked()
+    left = dataclasses.replace(found, verdict=Verdict.UNEXPLAINED)
+    assert not left._learns(None)
+    assert "in time, on a fitted recording," in _over_time(found, Explanation(latent))
+
+
+def test_the_friction_of_a_search_is_not_that_of_its_final_fit(differ: Fitted):
+    """The final fit has other sizes, and its mean is over all fitted runs."""
+    (h,) = differ.own.predictions
+    found: Any = SimpleNamespace(hypothesis=h, adapted=h)
+    validation: Any = SimpleNamespace(problem=differ.problem)
+    (note,) = own_friction_notes(found, validation, fitted_again=False)
+    assert "; other parts of these runs get the value of their run, other runs the mean of the" in note
+    (note,) = own_friction_notes(found, validation, fitted_again=True)
+    assert note.endswith(" N m in the training recordings (last model of the search, before the final fit).")
+
+
+def test_offsets_of_runs_that_validate_each_other_have_no_validation_data(differ: Fitted):
+    (h,), s = differ.own.predictions, differ.problem.supermodel
+    (offset,) = [p for p in s.calibrations if p.effect == "voltage_offset"]
+    apart: Any = SimpleNamespace(hypothesis=h, adapted=h, folds=())
+    (note,) = calibration_notes(s, apart, [offset], s.mechanism)
+    assert " V in the training data, " in note and " V in the validation data; it was fitted" in note
+    each_other: Any = SimpleNamespace(hypothesis=h, adapted=h, folds=(h, h))
+    (note,) = calibration_notes(s, each_other, [offset], s.mechanism)
+    assert " V in the recordings (" in note and " V where the model is fitted to the others); it was" in note
+    assert "validation" not in note
 
 
 @pytest.mark.parametrize("ratio", [1.0, 1.3])

@@ -25,16 +25,18 @@ from rotflex_jax.discover.discovery import Discovery
 from rotflex_jax.discover.explanation import Explanation, LatentTorqueComparison, remaining_failures
 from rotflex_jax.discover.learned_torque import LearnedTorqueResult
 from rotflex_jax.discover.probabilities import Probabilities, SetProbability
-from rotflex_jax.discover.result import FinalFit, Ranked, Round, RunErrors, Stage, Where
+from rotflex_jax.discover.result import FinalFit, HorizonGain, Ranked, Round, RunErrors, Stage, Where
 from rotflex_jax.discover.spline_map import Formula, Term
-from rotflex_jax.discover.tables import error_lists, next_steps
+from rotflex_jax.discover.tables import error_lists, final_fit_sentence, next_steps, status_sentence
 from rotflex_jax.discover.verdict import Verdict
-from rotflex_jax.effects import Coulomb, CubicSpring, LearnedTorque
+from rotflex_jax.effects import CATALOG, Coulomb, CubicSpring, LearnedTorque
+from rotflex_jax.effects.labels import effect_phrase
 from rotflex_jax.errors import InputError
 from rotflex_jax.fit.plausibility import Remark
 from rotflex_jax.fit.result import Fit, FitOptions
 from rotflex_jax.joints import paper, single_inertia
 from rotflex_jax.latent import LatentTorque
+from rotflex_jax.mechanism.quantity import Units
 from rotflex_jax.models.model import Model
 from rotflex_jax.parameters import Estimate
 from rotflex_jax.recording import Recording
@@ -762,6 +764,71 @@ def test_a_final_fit_gives_the_descriptions_and_notes_name_the_search(
         assert "at its lower bound (last model of the search, before the final fit)." in text
         assert "Another note." in text
     assert "before the final fit" not in printed(discovery, monkeypatch, capsys)
+
+
+def test_the_sentence_on_a_final_fit_says_what_it_was_compared_on(discovery) -> None:
+    """What was left out of the fit has another reason for an offset; runs may have validated each other."""
+    errors = RunErrors(discovery.final.held_out_rmse, discovery.final.held_out_rmse_windows)
+    options = FitOptions(window_seconds=2.0)
+    fit = Fit(Model(paper()), 1.0, "converged", (), {}, np.zeros((0, 0)), (), 9, options=options)
+    left_out = (("cubic_spring", "joint"), ("voltage_offset", "input"))
+    last = FinalFit(fit, discovery.train, Model(paper()), errors, errors, left_out=left_out)
+    found = dataclasses.replace(discovery, final_fit=last)
+    told = final_fit_sentence(found)
+    spring = effect_phrase("cubic_spring", "joint")
+    assert f"It is without {spring}, which the search has found: such runs are not clearly worse. " in told
+    assert (
+        "It is without voltage offset, which the search has found: such runs are not clearly worse, " in told
+    )
+    assert told.count("and other runs may not have it.") == 1
+    assert " Fitted in the same way without the validation data, its errors on these over 2 s are " in told
+    each_other = final_fit_sentence(dataclasses.replace(found, validation=found.train))
+    assert "validation" not in each_other
+    assert (
+        " Fitted in the same way to a part of the recordings, its errors on the others over 2 s" in each_other
+    )
+
+
+def test_the_sizes_of_an_established_effect_are_said_to_agree_only_if_they_were_compared(discovery) -> None:
+    gain = HorizonGain(1000.0, 10.0, 0.1)
+    first = dataclasses.replace(discovery.rounds[0], equivalent=(), prediction=gain, free_run=gain)
+    assert status_sentence(first).endswith("free runs are better with it, and its size agrees in all data.")
+    own = dataclasses.replace(first.stage, friction_of_runs={"hub.coulomb.level": (0.03, 0.1)})
+    said = status_sentence(dataclasses.replace(first, stage=own))
+    assert said.endswith("free runs are better with it, and its size differs between runs.")
+    other = dataclasses.replace(first, effect="delay", port="input")  # it has no amplitude
+    assert status_sentence(other).endswith("Established: predictions and free runs are better with it.")
+    sine = next(name for name, kind in CATALOG.items() if kind.line)
+    said = status_sentence(dataclasses.replace(first, effect=sine, port="input"))
+    assert said.endswith("free runs are better with it, and its size belongs to each recording.")
+
+
+def test_a_value_that_is_a_mean_of_recordings_is_printed_as_one(discovery, monkeypatch, capsys) -> None:
+    mean = [
+        dataclasses.replace(e, note="mean of 0.01, 0.05") if e.name == "hub.coulomb.level" else e
+        for e in discovery.final.estimates
+    ]
+    stage_ = dataclasses.replace(discovery.final, estimates=tuple(mean))
+    last = dataclasses.replace(discovery.rounds[-1], stage=stage_)
+    found = dataclasses.replace(discovery, rounds=(discovery.rounds[0], last))
+    assert "95 %: 0.02980 .. 0.03020   mean of 0.01, 0.05\n" in printed(found, monkeypatch, capsys)
+
+
+def test_a_machine_that_does_not_rotate_has_its_own_units_on_the_page(discovery, undrawn) -> None:
+    def on_rails(s: Stage) -> Stage:
+        mechanism = dataclasses.replace(s.model.mechanism, units=Units("m", "N"))
+        return dataclasses.replace(s, model=Model(mechanism))
+
+    found = dataclasses.replace(discovery, baseline=on_rails(discovery.baseline))
+    learned = map_of_friction(discovery, True)
+    learned = dataclasses.replace(learned, after=on_rails(learned.after))
+    latent = LatentTorqueComparison(photographed(), None)
+    text = read(render(found, Explanation(latent, learned))).text
+    assert "Fitted white force, baseline [N² s]" in text and "(N m)² s" not in text
+    assert "with position q [m] and speed w [m/s], it says" in text
+    turning = read(render(discovery, Explanation(latent, map_of_friction(discovery, True)))).text
+    assert "Fitted white torque, baseline [(N m)² s]" in turning
+    assert "with position q [rad] and speed w [rad/s], it says" in turning
 
 
 def test_places_name_the_recording_that_they_are_about(discovery, undrawn, monkeypatch, capsys) -> None:

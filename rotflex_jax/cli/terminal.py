@@ -153,7 +153,7 @@ def estimate_line(name: str, estimate: Any) -> str:
     text = f"{name} = {value} {estimate.unit}".rstrip()
     if all(map(math.isfinite, estimate.ci95)):
         text += f"   95 %: {low} .. {high}"
-    return f"{text}   {estimate.remark}" if estimate.given else text
+    return f"{text}   {estimate.remark}" if estimate.remark else text
 
 
 def print_discovery(result: Any) -> None:

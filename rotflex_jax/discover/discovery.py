@@ -69,13 +69,21 @@ class Discovery(SearchResult):
         return "\n".join(line for line in (*lines, final_fit_sentence(self)) if line)
 
     def latent_torque(self, progress: Callable[[str], None] | None = None) -> LatentTorqueComparison:
-        """Torques that the baseline and the final model lack, on a fitted and a validation recording."""
+        """Torques that the baseline and the final model lack, on a fitted and a validation recording.
+
+        If a part of the final model belongs to single recordings, they are those on a fitted recording alone.
+        """
         groups = (self.train, self.validation) if self.held_back else (self.train,)
-        # A periodic disturbance has the phase of the first recording in this model.
-        if any(e.line for e in self.final.model.mechanism.effects):
-            groups = (self.train[:1],)
+        before, after, alone = self.baseline, self.final, None
+        if any(e.line for e in after.model.mechanism.effects):
+            alone = 0  # a periodic disturbance has the phase of the first recording in this model
+        elif before.friction_of_runs or after.friction_of_runs:
+            alone = max(range(len(self.train)), key=lambda k: self.train[k].N)
+        if alone is not None:
+            groups = (self.train[alone : alone + 1],)
+            before, after = before.with_friction_of(alone), after.with_friction_of(alone)
         longest = [max(group, key=lambda r: r.N) for group in groups]
-        return compare_latent_torques(self.baseline, self.final if self.rounds else None, longest, progress)
+        return compare_latent_torques(before, after if self.rounds else None, longest, progress)
 
     def learned_torque(
         self, at: str = "hub", progress: Callable[[str], None] | None = None
@@ -87,9 +95,10 @@ class Discovery(SearchResult):
             progress: Called with a line of text at each stage.
 
         Raises:
-            InputError: If the search had no validation data, by which the smoothness of the map is chosen.
+            InputError: If the search had no validation data, which decide whether the map is kept, or if
+                friction differs between its runs.
         """
-        self._learns(True)  # refuses without validation data
+        self._learns(True)  # refuses what cannot be learned
         seconds, m = self.baseline.window_seconds, self.final.model.mechanism  # not fitted to validation data
         for effect in [e for e in m.effects if e.line]:  # its phase belongs to one recording
             m = m.without(effect.name, effect.at)
@@ -100,14 +109,20 @@ class Discovery(SearchResult):
         """Whether a report learns a torque, given what the user asks for.
 
         Raises:
-            InputError: It is asked for, but there are no validation data.
+            InputError: It is asked for, but there are no validation data, or friction differs between runs.
         """
+        differs = ", ".join(self.final.friction_of_runs)
         if learned is None:
-            return self.verdict == Verdict.UNEXPLAINED and self.held_back
+            return self.verdict == Verdict.UNEXPLAINED and self.held_back and not differs
         if checks.yes_or_no(learned, "learned") and not self.held_back:
             raise InputError(
                 "A learned torque needs validation data, but the training recordings of this search validate "
                 "each other; give `rf.discover` a recording as its `validation`."
+            )
+        if learned and differs:
+            raise InputError(
+                f"The runs differ in {differs}, but a torque is learned beside one friction for all runs; "
+                "give result.model_of(recording) and two parts of this recording to rf.learn_torque."
             )
         return learned
 
@@ -131,11 +146,12 @@ class Discovery(SearchResult):
 
         Args:
             learned: Whether to learn a torque at the port where most is left; if None, it is learned if the
-                verdict is `unexplained` and there are validation data.
+                verdict is `unexplained`, there are validation data and friction does not differ between runs.
             progress: Called with a line of text at each stage.
 
         Raises:
-            InputError: If a torque is to be learned without validation data.
+            InputError: If a torque is to be learned without validation data, or beside friction that
+                differs between runs.
         """
         say, learned = checks.progress(progress), self._learns(learned)
         say("report: torques that the models lack")
@@ -235,11 +251,11 @@ class Discovery(SearchResult):
         Args:
             folder: Folder to write to.
             learned: Whether to learn a torque for what is left, which takes about as long as a round; if
-                None, it is learned if the verdict is `unexplained`.
+                None, as for `explanation`.
             progress: Called with a line of text at each stage.
 
         Raises:
-            InputError: If a torque is to be learned without validation data; nothing is written then.
+            InputError: As `explanation`; nothing is written then.
         """
         from rotflex_jax.report import write_report  # the layer above, on request
 

@@ -156,12 +156,15 @@ def _better_in_each(
     return better and all(paired_gain(*blocks)[1] > SUPPORT_Z for blocks in each)
 
 
-def own_friction_notes(found: ValidatedHypothesis, validation: ValidationSet) -> tuple[str, ...]:
+def own_friction_notes(
+    found: ValidatedHypothesis, validation: ValidationSet, fitted_again: bool
+) -> tuple[str, ...]:
     """Sentences on sizes of friction that differ between runs, with their values.
 
     Args:
-        found: The final model.
+        found: The final model of the search.
         validation: The validation recordings.
+        fitted_again: Whether the model to use is that of a final fit, which has other sizes for other runs.
     """
     s, h, problem = validation.problem.supermodel, found.hypothesis, validation.problem
     names, specs = s.mechanism.parameter_names, s.mechanism.parameter_specifications
@@ -178,8 +181,8 @@ def own_friction_notes(found: ValidatedHypothesis, validation: ValidationSet) ->
 
     sentence = " The value in the validation data was fitted to them, and their errors are with it."
     fitted = sentence if unknown else ""
-    return tuple(
-        f"{names[i]} differs between runs: {where(i)}; other parts of these runs get the value of their run, "
-        f"other runs {'the mean' if len(each['training']) > 1 else 'the value'} of the training data.{fitted}"
-        for i in h.sizes
-    )
+    others = f"other runs {'the mean' if len(each['training']) > 1 else 'the value'} of the training data."
+    used = f"; other parts of these runs get the value of their run, {others}"
+    if fitted_again:
+        used = " (last model of the search, before the final fit)."
+    return tuple(f"{names[i]} differs between runs: {where(i)}{used}{fitted}" for i in h.sizes)

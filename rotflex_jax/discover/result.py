@@ -154,6 +154,11 @@ class Stage:
         """The model for validation recording `i`."""
         return self.of_validation[i] if self.of_validation else self.model
 
+    def with_friction_of(self, i: int) -> "Stage":
+        """The stage with a model that has the friction of training recording `i`."""
+        sizes = {name: each[i] for name, each in self.friction_of_runs.items()}
+        return dataclasses.replace(self, model=self.model.with_values(sizes)) if sizes else self
+
     def errors(self) -> dict[str, Any]:
         """All errors as plain JSON."""
         named = {
@@ -596,9 +601,14 @@ class SearchResult:
         return tuple(p for p in after if p not in before)
 
     @property
+    def calibrations(self) -> tuple[tuple[str, str], ...]:
+        """Offsets and biases that the search adds to the user's model."""
+        return tuple(calibrations(self.baseline.model.mechanism))
+
+    @property
     def offsets(self) -> tuple[tuple[str, str], ...]:
         """Offsets and biases among `added`."""
-        return tuple(p for p in calibrations(self.baseline.model.mechanism) if p in self.added)
+        return tuple(p for p in self.calibrations if p in self.added)
 
     @property
     def estimates(self) -> tuple[Estimate, ...]:

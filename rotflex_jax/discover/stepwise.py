@@ -599,10 +599,10 @@ def calibration_notes(
         for i in s.parameter_indices(location):
             unit, name = s.mechanism.parameter_specifications[i].unit, s.mechanism.parameter_names[i]
             columns = (h.values(s)[:, i] for h in (final.hypothesis, final.adapted))
-            trained, adapted = (", ".join(f"{v:+.3g} {unit}" for v in column) for column in columns)
             out.append(
                 f"{titled(location)} belongs to each recording, not to the machine: "
-                f"{trained} in the training data, {adapted} in the validation data; it was fitted, "
+                f"{_where_fitted(final, *([f'{v:+.3g} {unit}' for v in each] for each in columns))}; it was "
+                "fitted, "
                 + (
                     f"and the model to use has {common[name]:+.3g} {unit}."
                     if name in common
@@ -618,13 +618,21 @@ def disturbance_notes(s: SuperModel, final: ValidatedHypothesis) -> tuple[str, .
     for location in [p for p in final.hypothesis.locations if CATALOG[p.effect].line]:
         amplitudes = [i for i in s.parameter_indices(location) if i in s.phased]
         unit = s.mechanism.parameter_specifications[amplitudes[0]].unit
-        trained, adapted = (
-            ", ".join(f"{np.hypot(*row):.3g} {unit}" for row in h.values(s)[:, amplitudes])
+        sizes = (
+            [f"{np.hypot(*row):.3g} {unit}" for row in h.values(s)[:, amplitudes]]
             for h in (final.hypothesis, final.adapted)
         )
         out.append(
             f"{titled(location)} comes from outside and belongs to each recording, not to the machine: "
-            f"{trained} in the training data, {adapted} in the validation data. Size and phase were fitted "
+            f"{_where_fitted(final, *sizes)}. Size and phase were fitted "
             "to each: errors on validation data are those with it, errors on test recordings those without."
         )
     return tuple(out)
+
+
+def _where_fitted(final: ValidatedHypothesis, trained: Sequence[str], adapted: Sequence[str]) -> str:
+    """Values of each training and of each validation recording in words."""
+    first, second = ", ".join(trained), ", ".join(adapted)
+    if final.folds:  # the same recordings
+        return f"{first} in the recordings ({second} where the model is fitted to the others)"
+    return f"{first} in the training data, {second} in the validation data"

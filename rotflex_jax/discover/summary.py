@@ -162,7 +162,7 @@ def conclude(state: SearchState, evaluated: EvaluatedModels, started: float) -> 
             *conditional_note(conditional),
             *calibration_notes(supermodel, evaluated.final, state.own, used.mechanism),
             *_run_notes(state, evaluated.test),
-            *own_friction_notes(evaluated.final, state.validation),
+            *own_friction_notes(evaluated.final, state.validation, isinstance(last, FinalFit)),
             *disturbance_notes(supermodel, evaluated.final),
             *difference_notes(supermodel, evaluated.pairs, evaluated.final.hypothesis.sizes),
             *_far_baseline(state),

@@ -17,6 +17,7 @@ from rotflex_jax.discover.result import (
     longest_recording,
 )
 from rotflex_jax.discover.verdict import Grade, Verdict, grade
+from rotflex_jax.effects import CATALOG
 from rotflex_jax.effects.base import full_name
 from rotflex_jax.effects.labels import effect_label, effect_phrase
 from rotflex_jax.metrics import window_starts
@@ -243,23 +244,29 @@ def final_fit_sentence(discovery: SearchResult) -> str:
     found_by = "as the search has found" if searched else "without which every run is worse by far"
     apart = ", apart from their friction" if fitted_friction(discovery) else ""
     friction = f" Each run has a friction of its own size, {found_by}: {sizes}." if sizes else ""
-    needless = " and ".join(effect_phrase(*p) for p in found.left_out)
-    pronoun = "it" if len(found.left_out) == 1 else "them"
-    left_out = (
-        f" It is without {needless}, which the search has found: such runs are not clearly worse, and "
-        f"other recordings may not have {pronoun}."
-        if needless
-        else ""
+    offsets = [p for p in found.left_out if p in discovery.calibrations]
+    effects = [p for p in found.left_out if p not in offsets]
+    pronoun = "it" if len(offsets) == 1 else "them"
+    left_out = "".join(
+        f" It is without {' and '.join(effect_phrase(*p) for p in each)}, which the search has found: such "
+        f"runs are not clearly worse{further}."
+        for each, further in ((offsets, f", and other runs may not have {pronoun}"), (effects, ""))
+        if each
+    )
+    compared = (
+        f"Fitted in the same way without the validation data{apart}, its errors on these"
+        if discovery.held_back
+        else "Fitted in the same way to a part of the recordings, its errors on the others"
     )
     first = (
         "from measured first states"
         if found.fit.options.first == "measured"
-        else "with fitted first states, since from measured ones it does worse on validation data"
+        else "with fitted first states, since from measured ones it does worse on data that no fit has seen"
     )
     return (
         f"The model to use is the last one, fitted to {used} together, by free runs over {seconds:g} s "
-        f"{first}.{left_out}{laws}{friction} Fitted in the same way without the validation "
-        f"data{apart}, its errors on these over {seconds:g} s are {', '.join(shown)}{own}.{ending}{remarks}"
+        f"{first}.{left_out}{laws}{friction} {compared} over {seconds:g} s are {', '.join(shown)}{own}."
+        f"{ending}{remarks}"
     )
 
 
@@ -321,10 +328,24 @@ def status_sentence(added: Round) -> str:
     if not added.doubt and added.prediction is None:
         return "Established: training data show it, and validation runs are better with its trained value."
     if not added.doubt:
-        return "Established: predictions and free runs are better with it, and its size agrees in all data."
+        return f"Established: predictions and free runs are better with it{_agreement(added)}."
     if added.certain:
         return f"Provisional as a law: {added.doubt}."
     return f"Provisional, it may stand in for something else: {added.doubt}."
+
+
+def _agreement(added: Round) -> str:
+    """A clause on the sizes of an established effect in different data; empty for an effect without a size.
+
+    Sizes that belong to single recordings or runs are not compared.
+    """
+    kind = CATALOG[added.effect]
+    if kind.per_recording:
+        return ", and its size belongs to each recording"
+    names = {full_name(added.port, added.effect, name) for name in kind.amplitudes}
+    if names and names <= set(added.stage.friction_of_runs):
+        return ", and its size differs between runs"
+    return ", and its size agrees in all data" if names else ""
 
 
 def _cell(value: float, unit: str, floor: float | None) -> ErrorCell:

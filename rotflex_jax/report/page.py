@@ -46,6 +46,7 @@ from rotflex_jax.text.numbers import (
     ratio,
     readable,
     together,
+    unit_text,
     value_and_interval,
 )
 from rotflex_jax.text.plotting import by_section
@@ -265,9 +266,11 @@ def _settings(discovery: SearchResult) -> list[tuple[str, str]]:
         ("Candidate effects", str(len(discovery.ranking))),
         ("Time taken", f"{discovery.elapsed_s:.1f} s"),
     ]
+    own = discovery.baseline.model.mechanism.units
+    torque, unit = own.sentence("white torque"), unit_text(own.unit("(N m)^2 s"))
     for label, stage in zip(stage_labels(discovery), discovery.stages, strict=True):
         noise = ", ".join(f"{p} {plain_number(q)}" for p, q in stage.process_noise.items())
-        rows.append((f"Fitted white torque, {label} [(N\xa0m)² s]", noise or "none"))
+        rows.append((f"Fitted {torque}, {label} [{unit}]", noise or "none"))
     versions = ", ".join(f"{p} {_version(p)}" for p in REPORTED_PACKAGES)
     rows.append(("Versions", f"Python {platform.python_version()}, {versions}"))
     return rows
@@ -289,6 +292,7 @@ def _learned_torque(discovery: SearchResult, learned: LearnedTorqueResult) -> di
         falls.append(f"{channel} {plain_number(old)} → {plain_number(new)} {read}")
     return {
         "port": learned.at,
+        "motion": learned.model.mechanism.units.motion,
         "kept": learned.kept,
         "falls": ", ".join(falls),
         "gain": _with_sign(learned.held_out_gain_nats) + "\xa0nat",

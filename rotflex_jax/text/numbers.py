@@ -83,6 +83,8 @@ def plain_number(value: float | None, digits: int = 3) -> str:
 
     >>> plain_number(0.0123456), plain_number(1.5e-6), plain_number(None)
     ('0.0123', '1.5 × 10⁻⁶', '–')
+    >>> plain_number(136.2, 2), plain_number(-99.96, 2)
+    ('136', '−100')
     """
     if value is None or not math.isfinite(value):
         return "–"
@@ -90,9 +92,10 @@ def plain_number(value: float | None, digits: int = 3) -> str:
         mantissa, power = f"{value:.{digits - 1}e}".split("e")
         raised = str(int(power)).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
         return f"{float(mantissa):g} × 10{raised}".replace("-", "−")
-    if abs(value) >= 1000:
-        return f"{value:,.0f}".replace(",", "\u202f").replace("-", "−")
-    return f"{value:#.{digits}g}".rstrip(".").replace("-", "−")
+    text = f"{value:#.{digits}g}".rstrip(".")
+    if abs(value) >= 1000 or "e" in text:  # an exponent: more digits before the point than significant ones
+        text = f"{value:,.0f}".replace(",", "\u202f")
+    return text.replace("-", "−")
 
 
 def json_number(value: float) -> float | None:

@@ -249,11 +249,19 @@ def latent_over_motion(discovery: SearchResult, explanation: Explanation) -> Fig
     return latent_maps(latent.before, latent.after) if latent else None
 
 
+def _over_time(discovery: SearchResult, explanation: Explanation) -> str:
+    # The last of several recordings is drawn, which is a validation recording.
+    several = explanation.latent is not None and len(explanation.latent.before.Ts) > 1
+    return (
+        f"The same torques in time, on {'held-out data' if several else 'a fitted recording'}, and by "
+        "frequency. Fast changes are below the noise of the sensor, so a jump looks rounded."
+    )
+
+
 @figure(
     "latent_time",
     section="torque",
-    caption="The same torques in time, on held-out data, and by frequency. Fast changes are below the "
-    "noise of the sensor, so a jump looks rounded.",
+    caption=_over_time,
     description="The unknown torque at each port over time with its band, and its spectrum.",
 )
 def latent_over_time(discovery: SearchResult, explanation: Explanation) -> Figure | None:
