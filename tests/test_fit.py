@@ -323,6 +323,17 @@ def test_asking_for_a_parameter_that_is_not_there(recovered):
         recovered[0][0]["hub.coulomb.height"]
 
 
+def test_a_machine_that_rests_without_voltage_can_be_fitted():
+    """While friction holds it, its speed falls through numbers whose square is zero."""
+    t = 0.005 * np.arange(400)
+    u = np.where(t < 1.0, 2.0 * np.sin(9.0 * t), 0.0)
+    truth = single_inertia() + fx.Coulomb("hub", level=0.02)
+    theta = simulate(truth, u, 0.005)[:, 0] + 1e-3 * np.random.default_rng(0).standard_normal(len(t))
+    found = fit(truth.with_values({"hub.coulomb.level": 0.03}), Recording(u=u, y=theta, Ts=0.005))
+    assert found.status == "converged"
+    assert found.model.mechanism.named_values["hub.coulomb.level"] == pytest.approx(0.02, rel=0.05)
+
+
 def test_one_inertia_by_hand():
     """Reference in closed form: the speed approaches its final value as exp(-t / T)."""
     joint = single_inertia(0.004, damping=0.01)

@@ -18,6 +18,7 @@ from rotflex_jax.mechanism.friction import (
     sliding_torques,
     solve_masked,
 )
+from rotflex_jax.mechanism.gear import crossing_time
 from rotflex_jax.runtime.xla import double_precision
 
 CASES = 400
@@ -82,14 +83,26 @@ def test_a_contact_alone_moves_from_event_to_event() -> None:
     assert 20 < rests < CASES / 2
 
 
-def test_a_contact_at_rest_without_a_drive_has_derivatives() -> None:
-    """At rest, friction cancels a small drive: its torque is `-free / stop`, the levels do not matter."""
+@pytest.mark.parametrize("free", [0.0, 1e-20, -1e-170, 1e-300, 5e-324])
+def test_a_contact_at_rest_without_a_drive_has_derivatives(free: float) -> None:
+    """At rest, friction cancels a small drive: its torque is `-free / stop`, the levels do not matter.
+
+    From sample to sample, the speed of a machine at rest falls by a factor of 1e16, through numbers whose
+    square is zero.
+    """
 
     def torque(v0, free, stop, up, down):
         return independent_contacts(v0, free, stop, up, down).torque
 
-    slopes = run(jax.grad(torque, argnums=(0, 1, 2, 3, 4)), 0.0, 0.0, 2.0, 0.3, 0.4)
-    np.testing.assert_array_equal(slopes, [0.0, -0.5, 0.0, 0.0, 0.0])
+    slopes = run(jax.grad(torque, argnums=(0, 1, 2, 3, 4)), 0.0, free, 2.0, 0.3, 0.4)
+    np.testing.assert_allclose(slopes, [0.0, -0.5, 0.0, 0.0, 0.0], atol=1e-20)
+
+
+@pytest.mark.parametrize("speed", [0.0, 1e-20, -1e-170, 5e-324])
+def test_a_rotor_that_friction_holds_in_flight_has_derivatives(speed: float) -> None:
+    """The time at which it would reach a stop is computed from its speed, and is not used."""
+    slopes = run(jax.grad(crossing_time, argnums=(0, 1, 2)), -0.1, speed, -speed)
+    assert np.all(np.isfinite(slopes))
 
 
 @pytest.mark.parametrize("side", [0.999, 1.001])

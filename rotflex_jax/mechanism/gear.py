@@ -29,6 +29,7 @@ from rotflex_jax.mechanism.assembly import (
     phi_functions,
     stamped,
 )
+from rotflex_jax.mechanism.friction import divided
 from rotflex_jax.mechanism.mechanism import Mechanism
 from rotflex_jax.mechanism.shortcut import shortcut
 from rotflex_jax.mechanism.small_matrices import matvec, with_rows
@@ -295,4 +296,4 @@ def crossing_time(
     straight = way * b >= 0
     below = jnp.where(straight, b + root, 2 * d)
     above = jnp.where(straight, 2 * distance, root - b)
-    return above / jnp.where(below == 0, 1.0, below)
+    return divided(above, below)
