@@ -27,7 +27,13 @@ from rotflex_jax.discover.learned_torque import LearnedTorqueResult
 from rotflex_jax.discover.probabilities import Probabilities, SetProbability
 from rotflex_jax.discover.result import FinalFit, HorizonGain, Ranked, Round, RunErrors, Stage, Where
 from rotflex_jax.discover.spline_map import Formula, Term
-from rotflex_jax.discover.tables import error_lists, final_fit_sentence, next_steps, status_sentence
+from rotflex_jax.discover.tables import (
+    error_lists,
+    final_fit_sentence,
+    next_steps,
+    parameter_rows,
+    status_sentence,
+)
 from rotflex_jax.discover.verdict import Verdict
 from rotflex_jax.effects import CATALOG, Coulomb, CubicSpring, LearnedTorque
 from rotflex_jax.effects.labels import effect_phrase
@@ -819,12 +825,18 @@ def test_a_machine_that_does_not_rotate_has_its_own_units_on_the_page(discovery,
         mechanism = dataclasses.replace(s.model.mechanism, units=Units("m", "N"))
         return dataclasses.replace(s, model=Model(mechanism))
 
-    found = dataclasses.replace(discovery, baseline=on_rails(discovery.baseline))
+    rounds = tuple(dataclasses.replace(r, stage=on_rails(r.stage)) for r in discovery.rounds)
+    found = dataclasses.replace(discovery, baseline=on_rails(discovery.baseline), rounds=rounds)
     learned = map_of_friction(discovery, True)
     learned = dataclasses.replace(learned, after=on_rails(learned.after))
     latent = LatentTorqueComparison(photographed(), None)
     text = read(render(found, Explanation(latent, learned))).text
     assert "Fitted white force, baseline [N² s]" in text and "(N m)² s" not in text
+    meanings = {row.name: row.meaning for row in parameter_rows(found)}
+    assert (meanings["hub.inertia.inertia"], meanings["hub.viscous.coefficient"]) == (
+        "mass",
+        "force per speed",
+    )
     assert "with position q [m] and speed w [m/s], it says" in text
     turning = read(render(discovery, Explanation(latent, map_of_friction(discovery, True)))).text
     assert "Fitted white torque, baseline [(N m)² s]" in turning

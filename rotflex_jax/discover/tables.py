@@ -391,7 +391,7 @@ def _meanings(models: Sequence[Model]) -> dict[str, str]:
     for model in models:
         m = model.mechanism
         pairs = zip(m.parameter_names, m.parameter_specifications, strict=True)
-        found |= {name: spec.meaning for name, spec in pairs}
+        found |= {name: m.units.sentence(spec.meaning) for name, spec in pairs}
     return found
 
 

@@ -21,7 +21,13 @@ _UNIT = re.compile(
 )
 _VOLTS = re.compile(r"\b(m?)V\b")
 _ANGLE_TOO = re.compile(r" \([-+]?[\d.e+-]+ degrees\)")
-_WORDS = (("torque", "force"), ("turning", "moving"), ("turns", "moves"), ("turned", "moved"))
+_WORDS = (
+    ("moment of inertia", "mass"),
+    ("torque", "force"),
+    ("turning", "moving"),
+    ("turns", "moves"),
+    ("turned", "moved"),
+)
 
 
 class Units(NamedTuple):
