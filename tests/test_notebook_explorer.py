@@ -43,6 +43,15 @@ def test_it_begins_with_the_model_as_given(explorer: Explorer) -> None:
     assert max(explorer.errors.values()) < 1.5e-3
 
 
+def test_a_linear_candidate_is_off_at_first_too(truth: rf.Mechanism, recording: rf.Recording) -> None:
+    """Linear effects of the model have no switch, since without an inertia nothing moves."""
+    spring = rf.effects.Spring(at="hub", stiffness=3.0)
+    given, offered = (rf.explore(truth, recording, candidates=c) for c in ((), [spring]))
+    assert offered.errors == pytest.approx(given.errors)
+    offered.switches["linear spring at hub"].value = True
+    assert offered.errors["theta"] > 5 * given.errors["theta"]
+
+
 def test_switching_an_effect_off_and_on_shows_at_once(explorer: Explorer) -> None:
     before, picture = dict(explorer.errors), explorer._image.value
     explorer.switches[FRICTION].value = False

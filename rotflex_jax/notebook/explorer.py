@@ -173,7 +173,7 @@ class Explorer:
         self._solver: dict[str, Any] = {}
         if not isinstance(model, Mechanism):
             self._solver["solver"] = _model(model).solver
-        off = {effect_label(e.name, e.at) for e in offered}
+        off = self._offered = {effect_label(e.name, e.at) for e in offered}
         self._train = listed(recordings)
         self._drawn = self._train[0]
         self._test = listed(recordings if test is None else test)
@@ -188,7 +188,7 @@ class Explorer:
         self.addable = widgets.Dropdown(description="effect")
         self._text, self._image = widgets.HTML(), widgets.Image(format="png")
         self._left = widgets.VBox()
-        self._silently(lambda: self._build({label: label not in off for label in _labels(bare)}, ()))
+        self._silently(lambda: self._build({label: label not in off for label in self._labels(bare)}, ()))
         self._given = self._state()
         self._given_model = self.model = self._stands()
         self.given = self.errors = self._errors(self.model)
@@ -323,7 +323,7 @@ class Explorer:
         m, widgets = self._base, self._widgets
         self.switches = {
             label: widgets.Checkbox(value=on.get(label, True), description=label, indent=False)
-            for label in _labels(m)
+            for label in self._labels(m)
         }
         self._unit = {
             n: unit_text(spec.unit)
@@ -343,6 +343,11 @@ class Explorer:
         places = [p for p in ((cls.name, at) for cls, at in search_places(m)) if p not in present]
         self.addable.options = [(effect_label(*p), p) for p in places if m.accepts(CATALOG[p[0]], p[1])]
         self._left.children = (*self.switches.values(), *self.sliders.values())
+
+    def _labels(self, m: Mechanism) -> list[str]:
+        """Labels of the effects that have a switch, in the order of the mechanism; candidates always do."""
+        labels = {effect_label(e.name, e.at): _can_be_off(e) for e in m.effects}
+        return [label for label, can_be_off in labels.items() if can_be_off or label in self._offered]
 
     def _set_sliders(self) -> None:
         for name, slider in self.sliders.items():
@@ -440,11 +445,6 @@ def _model(given: Any) -> Model:
         f"A model was expected, but a {type(given).__name__} was given; give a Fit, Model, Mechanism or "
         "Discovery."
     )
-
-
-def _labels(m: Mechanism) -> list[str]:
-    """Labels of the effects that have a switch, in the order of the mechanism."""
-    return [effect_label(e.name, e.at) for e in m.effects if _can_be_off(e)]
 
 
 def _can_be_off(effect: Effect) -> bool:
