@@ -380,7 +380,9 @@ def test_a_report_without_rounds_says_so(undrawn) -> None:
     found = nothing()
     assert "evenly" in found.where[0].statement
     text = read(render(found)).text
-    assert "No effect was added" in text
+    assert f"No effect was added: none of the {len(found.ranking)} candidates made the model better" in text
+    untried = dataclasses.replace(found, ranking=())
+    assert "No effect was added: no candidate was tried." in read(render(untried)).text
     assert "Where the error occurs" in text
     assert "staircase" not in pictures(found)
 
