@@ -206,7 +206,7 @@ def test_a_machine_that_neither_turns_nor_slides_is_refused():
 def test_switched_off_effects_are_not_exported():
     model = Model(JOINT + Coulomb("hub", level=0.5), gates=(*[1.0] * 6, 0.0))
     assert certified(model).certificate.largest[0] < NOISE
-    with pytest.raises(InputError, match="an effect is on or off"):
+    with pytest.raises(InputError, match="effects that are on or off"):
         to_mjcf(Model(JOINT, gates=(0.5,) * 6), Ts)
 
 

@@ -126,8 +126,8 @@ class Model:
             return self
         if any(gate not in (0.0, 1.0) for gate in self.gates):
             raise InputError(
-                f"The model has the gates {self.gates}, but here an effect is on or off; give 1 or 0 for "
-                "each."
+                f"The gates of the model are {', '.join(f'{g:g}' for g in self.gates)}, but only effects "
+                "that are on or off are taken here; give 1 or 0 for each."
             )
         m = self.mechanism
         on = tuple(e for e, gate in zip(m.effects, self.gates, strict=True) if gate)
