@@ -121,8 +121,10 @@ def discover(
     checks.number(calibrate_seconds, "calibrate_seconds", least=0, unit="s", example="2.0")
     # 1. Prepare: one super-model with every candidate built in, the recordings at both horizons.
     trained = listed(train, "train", SHORTEST_TO_FIT)
-    held_back = listed_if_given(validation, "validation", SHORTEST_TO_FIT)
-    tested = listed_if_given(test, "test", SHORTEST_TO_FIT)
+    held_back, tested = (
+        listed_if_given(() if given is None else given, name, SHORTEST_TO_FIT)
+        for name, given in (("validation", validation), ("test", test))
+    )
     model, left_out = _with_signals(model, (*trained, *held_back), tested)
     if candidates is not None:
         candidates = checked_candidates(model.mechanism, candidates)

@@ -598,8 +598,8 @@ read a file with rotflex_jax.load.
 
 
 def listed_if_given(recordings: Any, name: str, shortest: int = 1) -> tuple[Recording, ...]:
-    """As `listed`, for an argument that may be None or empty."""
-    none = recordings is None or (isinstance(recordings, Sequence) and not len(recordings))
+    """As `listed`, for an argument that may be empty."""
+    none = isinstance(recordings, Sequence) and not len(recordings)
     return () if none else listed(recordings, name, shortest)
 
 
