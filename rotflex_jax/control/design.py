@@ -19,6 +19,7 @@ from rotflex_jax.mechanism import Mechanism
 from rotflex_jax.mechanism.assembly import Layout, effects_of, equations, rest_state
 from rotflex_jax.mechanism.linear import check_movable, process_covariance, state_names, zero_order_hold
 from rotflex_jax.mechanism.mechanism import check_input_alone
+from rotflex_jax.mechanism.quantity import input_word
 from rotflex_jax.mechanism.step import (
     advance_memories,
     friction_level,
@@ -241,7 +242,7 @@ class Controller:
     @property
     def input_name(self) -> str:
         """`voltage` if the controller gives a voltage; otherwise `input`, such as a goal or a current."""
-        return "voltage" if self.model.mechanism.units.input == "V" else "input"
+        return input_word(self.model.mechanism.units.input)
 
     @functools.cached_property
     def poles(self) -> Complex[np.ndarray, " n"]:

@@ -13,7 +13,7 @@ from rotflex_jax.discover.friction_of_runs import (
 )
 from rotflex_jax.discover.hypothesis import CandidateStart, generalisations, parameter_count
 from rotflex_jax.discover.pairs import best_candidates, find_pair, is_unexplained
-from rotflex_jax.discover.score_test import Score, candidates_to_score, promising_at_both, residual_lines
+from rotflex_jax.discover.score_test import Score, candidates_to_score, promising_at_both
 from rotflex_jax.discover.search_state import SearchState
 from rotflex_jax.discover.selection import (
     choose,
@@ -79,7 +79,7 @@ def score_candidates(state: SearchState) -> list[Promising]:
 def _scored(state: SearchState) -> str:
     """The number of candidates that a round scores, and those that it leaves out, in words."""
     s, h = state.problem.supermodel, state.origin.hypothesis
-    scored = candidates_to_score(s, h, residual_lines(state.problem, h))
+    scored = candidates_to_score(s, h, state.error_lines(state.origin))
     left_out = [str(p) for p in s.candidates if p not in (*scored, *h.locations)]
     without = f"; without {', '.join(left_out)}, as the errors have no line that the input lacks"
     return f"{len(scored)} candidates" + without * bool(left_out)

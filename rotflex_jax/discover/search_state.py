@@ -38,7 +38,7 @@ from rotflex_jax.discover.stepwise import (
     fit_baseline,
     fit_free_run_baseline,
 )
-from rotflex_jax.discover.supermodel import EffectLocation
+from rotflex_jax.discover.supermodel import EffectLocation, ErrorLine
 from rotflex_jax.discover.validation import (
     Horizons,
     SearchHorizon,
@@ -81,8 +81,9 @@ class SearchState:
         in_place_of: The effect that replaces several -> the replaced effect whose place in the order it has.
         machine: Calibrations that belong to the machine.
         start: The model for which candidates were scored first, and its best pairs of candidates.
-        tests: Score tests of the model `tested`, in predictions and in free runs.
-        tested: The model of the last score tests.
+        tested: The model of which `lines` and `tests` are kept.
+        lines: Lines in the spectrum of its errors that the input does not have.
+        tests: Its score tests, in predictions and in free runs; None before they are made.
         nominal: The user's model with its given values; None unless the fit has moved far away from them.
         resumed: Number of rounds of a stopped search after which this search continued.
         reading_notes: Notes that recordings may have been read wrongly, or cannot decide.
@@ -114,8 +115,9 @@ class SearchState:
     in_place_of: dict[EffectLocation, EffectLocation] = dataclasses.field(default_factory=dict)
     machine: list[EffectLocation] = dataclasses.field(default_factory=list)
     start: tuple[ValidatedHypothesis, list[tuple[PairScore, PairScore]]] | None = None
-    tests: tuple[ScoreTest, ScoreTest] | None = None
     tested: Hypothesis | None = None
+    lines: tuple[ErrorLine, ...] = ()
+    tests: tuple[ScoreTest, ScoreTest] | None = None
     nominal: ValidatedHypothesis | None = None
 
     @property
@@ -225,12 +227,18 @@ class SearchState:
             line.kept = stage.to_dict(self.digest)
         self.say(line)
 
+    def error_lines(self, beside: ValidatedHypothesis) -> tuple[ErrorLine, ...]:
+        """Lines in the errors of a model, at which a periodic disturbance is scored; the last are kept."""
+        if self.tested is not beside.hypothesis:
+            self.tested, self.tests = beside.hypothesis, None
+            self.lines = residual_lines(self.problem, beside.hypothesis)
+        return self.lines
+
     def score_tests(self, beside: ValidatedHypothesis) -> tuple[ScoreTest, ScoreTest]:
         """Score tests of all candidates for a model, in predictions and in free runs; the last are kept."""
         assert beside.free_run
-        if self.tests is None or self.tested is not beside.hypothesis:
-            self.tested = beside.hypothesis
-            lines = residual_lines(self.problem, beside.hypothesis)
+        lines = self.error_lines(beside)
+        if self.tests is None:
             self.tests = (
                 score_test(self.problem, beside.hypothesis, lines),
                 score_test(self.horizons.free_run.problem, beside.free_run.hypothesis, lines),

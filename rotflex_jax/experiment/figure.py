@@ -4,7 +4,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from rotflex_jax.experiment.result import Experiment, Segment, SequentialResult, input_word
+from rotflex_jax.experiment.result import Experiment, Segment, SequentialResult
+from rotflex_jax.mechanism.quantity import input_word
 from rotflex_jax.text.colours import BASELINE, FAINT, FINAL, FURTHER, INK
 from rotflex_jax.text.plotting import blank, legend_above, plain_ticks, styled, thinned
 

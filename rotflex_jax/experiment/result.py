@@ -11,15 +11,11 @@ from jaxtyping import Float
 
 from rotflex_jax.errors import InputError
 from rotflex_jax.experiment.standard_inputs import Limits
+from rotflex_jax.mechanism.quantity import input_word
 from rotflex_jax.recording import Recording
 from rotflex_jax.text.files import write_file
 from rotflex_jax.text.markup import bullets, card, paragraph, table
 from rotflex_jax.text.numbers import json_numbers, one_line
-
-
-def input_word(unit: str) -> str:
-    """`voltage`, or `input` where it has another unit, such as a goal or a current."""
-    return "voltage" if unit == "V" else "input"
 
 
 def voltage_file(

@@ -14,6 +14,7 @@ from rotflex_jax.errors import InputError
 from rotflex_jax.latent.in_time import Drift, PeriodicTorque, drift, periodic_torques
 from rotflex_jax.mechanism import Mechanism
 from rotflex_jax.mechanism.assembly import effects_of
+from rotflex_jax.mechanism.quantity import input_word
 from rotflex_jax.models.model import Model
 from rotflex_jax.parameters import HALF_WIDTH_95
 from rotflex_jax.recording import Recording
@@ -223,7 +224,7 @@ class LatentTorque:
                 f"{'deflection' if sprung else 'position'} of the {port}",
                 self.motion,
             ),
-            "voltage": (self.voltage, "voltage" if self.input == "V" else "input", self.input),
+            "voltage": (self.voltage, input_word(self.input), self.input),
             "time": (self.time, "time", "s"),
         }
         if against not in known:

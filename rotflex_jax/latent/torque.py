@@ -137,15 +137,9 @@ def _predicted_trajectory(model: Model, augmented: Mechanism, dataset: Dataset) 
     m, first = model.mechanism, dataset.first_states
     x0 = np.tile(rest_state(m.structure, np.float64), (len(first), 1))
     x0[:, : first.shape[1]] = first
-    process_noise = process_noise_ports(m, (0.03 * dataset.torque_scale) ** 2)
-    K = np.stack(
-        [
-            kalman_gains(m, [process_noise], dataset.noise, float(Ts), model._switches())[0]
-            for Ts in dataset.data.Ts
-        ]
-    )
-    count = len(augmented.effects) - len(m.effects)
-    switches = np.r_[model._switches(), np.ones(count)]
+    intensities, gates = [process_noise_ports(m, (0.03 * dataset.torque_scale) ** 2)], model._switches()
+    K = np.stack([kalman_gains(m, intensities, dataset.noise, float(Ts), gates)[0] for Ts in dataset.data.Ts])
+    switches = np.r_[gates, np.ones(len(augmented.effects) - len(m.effects))]
     arrays = jax.tree.map(jnp.asarray, (augmented.values, switches, x0, dataset.data, K))
     return np.asarray(predicted_states(augmented.structure, model.solver, *arrays))
 

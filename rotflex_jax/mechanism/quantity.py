@@ -30,6 +30,11 @@ _WORDS = (
 )
 
 
+def input_word(unit: str) -> str:
+    """`voltage`, or `input` where it has another unit, such as a goal or a current."""
+    return "voltage" if unit == "V" else "input"
+
+
 class Units(NamedTuple):
     """Units of the ports of a machine.
 
