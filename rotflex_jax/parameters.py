@@ -68,7 +68,7 @@ def _declared(owner: type) -> dict[str, Specification]:
     return {f.name: f.metadata["parameter"] for f in dataclasses.fields(owner) if "parameter" in f.metadata}
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class Transform:
     """Transform between unconstrained `z` and physical `p`, elementwise, by the bounds of each parameter.
 

@@ -1,5 +1,6 @@
 """A recording: its defaults, its parts, its signals, and the findings on the quality of its data."""
 
+import copy
 import dataclasses
 import pickle
 import re
@@ -96,7 +97,12 @@ def test_data_are_copied_and_cannot_be_changed() -> None:
             array[0] = 7.0
     with pytest.raises(AttributeError):
         recording.Ts = 1.0  # pyright: ignore
-    assert pickle.loads(pickle.dumps(recording)).channels == recording.channels
+    with_signal = recording.with_signals({"base [m/s^2]": np.sin(u)})
+    for copied in (pickle.loads(pickle.dumps(with_signal)), copy.deepcopy(with_signal)):
+        assert copied.channels == recording.channels
+        for array in (copied.u, copied.y, copied.signals["base [m/s^2]"]):
+            with pytest.raises(ValueError, match="read-only"):
+                array[0] = 7.0
 
 
 def test_split_cuts_in_the_order_of_time_and_keeps_the_clock() -> None:

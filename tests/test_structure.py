@@ -1,5 +1,7 @@
 """The code has the architecture that docs/design.md describes."""
 
+import dataclasses
+import importlib
 import re
 import sys
 import tomllib
@@ -10,6 +12,7 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.append(str(ROOT / "docs"))  # for `generate`, which measures the package
 
+from generate import reference  # noqa: E402
 from generate.structure import Package, largest_circle, repeated, shapes  # noqa: E402
 
 
@@ -59,3 +62,21 @@ def test_the_arena_simulator_imports_nothing_of_the_package(package: Package) ->
 
 def test_public_functions_state_the_shapes_of_their_arrays(package: Package) -> None:
     assert shapes(package)["missing"] == []
+
+
+def test_public_results_with_arrays_compare_by_identity() -> None:
+    """Of two arrays, `==` is an array, which has no truth: `result in results` would raise an error.
+
+    Settings of filters, which usually are single numbers (`float | ...`), compare by value.
+    """
+    seen = 0
+    for name in reference.PACKAGES:
+        importlib.import_module(name)
+        module = sys.modules[name]  # not an attribute: `rotflex_jax.fit` is the function
+        for public in (getattr(module, public) for public in reference.public_names(module)):
+            if dataclasses.is_dataclass(public) and isinstance(public, type):
+                types = [str(field.type) for field in dataclasses.fields(public)]
+                if any("ndarray" in t and not t.startswith("float |") for t in types):
+                    assert public.__eq__ is object.__eq__, public
+                    seen += 1
+    assert seen > 20

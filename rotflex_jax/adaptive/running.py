@@ -25,7 +25,7 @@ from rotflex_jax.runtime.xla import working_precision
 DIVERGENCE_RATIO = 1e4
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Run:
     """Result of a filter over a number of samples.
 

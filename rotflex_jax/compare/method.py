@@ -31,7 +31,7 @@ class Simulator(Protocol):
         ...
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class Fitted:
     """The model that a method has learned from recordings.
 

@@ -66,7 +66,7 @@ def _one_step(row: "Row", channel: str, unit: str) -> float | None:
 ChannelErrors = dict[str, float]
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class Row:
     """Result of one method.
 

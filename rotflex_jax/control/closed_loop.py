@@ -68,7 +68,7 @@ class Plant(Protocol):
         ...
 
 
-@dataclasses.dataclass(frozen=True, repr=False)
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class ClosedLoop:
     """A run in closed loop.
 

@@ -36,7 +36,7 @@ PASSES = 4
 """Number of iterations in which torques and planned motion are computed from each other in turn."""
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class PlannedMotion:
     """Planned states of the linear part at each sample, and the voltage that leads it along them.
 
@@ -55,7 +55,7 @@ class PlannedMotion:
     torques: Float[np.ndarray, "N p"]
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class Tracking:
     """Linear quadratic tracking of a reference that is known beforehand, by the linear part.
 
@@ -195,7 +195,7 @@ ENCODER = 2 * np.pi / 4096
 """Default step of the sensors [rad]."""
 
 
-@dataclasses.dataclass(frozen=True, repr=False)
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class Controller:
     """Feedback in discrete time about a planned motion; made by `controller`.
 

@@ -17,7 +17,7 @@ from rotflex_jax.recording.samples import LONGEST_STEP, finite, name_and_unit, s
 from rotflex_jax.text.files import is_search_result
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Table:
     """Named columns.
 

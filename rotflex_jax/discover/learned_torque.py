@@ -38,7 +38,7 @@ SPLINES = (8, 15)
 EVEN_SPEED_SHARE = 0.1
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class LearnedTorqueResult:
     """A learned torque with its gain, its map and its formula.
 

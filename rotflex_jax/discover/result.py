@@ -97,7 +97,7 @@ class RunErrors(NamedTuple):
     windows: dict[str, float]
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class Stage:
     """One model of the search, fitted, and evaluated on validation recordings.
 
@@ -458,7 +458,7 @@ class Ranked:
         }
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class Where:
     """One statement of where the model fails.
 

@@ -30,7 +30,7 @@ NESTED_SHARE, NEGLIGIBLE_EVIDENCE = 0.05, 10.0
 SMOOTH_MAXIMUM_EXPONENT = 24
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class Discrimination:
     """Both models under one voltage, each fitted by its rival.
 

@@ -92,7 +92,7 @@ class Rated:
         return dataclasses.asdict(self) | {"each": list(self.each)}
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class Experiment:
     """What to record next to distinguish two effects.
 
@@ -200,7 +200,7 @@ class Experiment:
         return "\n".join([*lines, *(f"  {note}" for note in self.notes)])
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class Segment:
     """The next segment on the rig: the input after which a wrong answer is least probable.
 

@@ -70,7 +70,7 @@ class SequentialSettings:
     check_seconds: float | None = None
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class SequentialExperiment:
     """The state of a sequential experiment; each step returns a new state.
 

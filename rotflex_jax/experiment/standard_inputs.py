@@ -106,7 +106,7 @@ NOISE_CREST, MULTISINE_CREST = 2.5, 1.7
 REDUCED_AMPLITUDES = (0.5, 0.25)
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class StandardInput:
     """One standard input.
 

@@ -20,7 +20,7 @@ from rotflex_jax.models.model import Model
 from rotflex_jax.runtime.xla import double_precision
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class LinearModel:
     """`x' = A x + B u`, `y = C x + D u`, all deviations from an operating point.
 

@@ -59,7 +59,7 @@ class FitOptions:
     ranges: tuple[tuple[float, ...], tuple[float, ...]] | None = None
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class Fit:
     """A fitted model and how it was reached.
 

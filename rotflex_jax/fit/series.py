@@ -26,7 +26,7 @@ from rotflex_jax.parameters import Estimate, Specification
 from rotflex_jax.recording import Recording
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class SeriesFit:
     """Fitted weights on a basis; attributes with the same name as in `Fit` have the same meaning.
 

@@ -35,7 +35,7 @@ ASKED_FOR = 10.0
 PRIOR_STAYS = 3
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class TorqueCurve:
     """Mean of a torque in bins of another signal.
 
@@ -117,7 +117,7 @@ Abscissa = Literal["speed", "position", "deflection", "voltage", "time"]
 CURVE_BINS = 40
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class LatentTorque:
     """Torques that a model lacks, along all samples of its recordings.
 

@@ -9,7 +9,7 @@ from rotflex_jax.recording import Recording
 from rotflex_jax.recording.samples import require_period
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class LinearSystem:
     """A sampled linear system in innovations form, with an offset.
 

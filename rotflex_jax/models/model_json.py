@@ -36,7 +36,7 @@ LARGEST_COUNT = 1000
 _SOLVERS = {cls.__name__: cls for cls in (Exponential, SmoothRK4)}
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class Saved:
     """The contents of a model file.
 

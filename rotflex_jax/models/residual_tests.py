@@ -16,7 +16,7 @@ LONGEST_STRETCH = 8.0
 BINS_PER_DECADE = 24
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class FrequencyResponse:
     """Response of outputs to an input, from their spectra.
 
@@ -88,7 +88,7 @@ def _bins(f: Float[np.ndarray, " L"]) -> Int[np.ndarray, " F"]:
 QUANTILE_99 = 2.5758293035489004
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class ResidualTests:
     """Correlations of residuals with themselves and with the input, each with its 99 % band.
 

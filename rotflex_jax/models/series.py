@@ -13,7 +13,7 @@ from rotflex_jax.recording import Recording
 from rotflex_jax.recording.samples import require_period, sampling_period
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class Series:
     """A weighted sum of the regressors that a basis forms from the input.
 

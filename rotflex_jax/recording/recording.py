@@ -171,6 +171,12 @@ class Recording:
         if self.accept != quality.ACCEPTABLE:
             quality.refuse(self.findings)
 
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """A copy, or a recording of another process: NumPy does not keep that an array is read-only."""
+        for x in (state["u"], state["y"], *state["signals"].values()):
+            x.setflags(write=False)
+        self.__dict__.update(state)
+
     @cached_property
     def findings(self) -> tuple[Finding, ...]:
         """Findings on the quality of the data."""
