@@ -3,6 +3,7 @@
 import dataclasses
 import importlib
 import json
+import re
 
 import jax
 import jax.numpy as jnp
@@ -248,6 +249,7 @@ def test_friction_is_learned_and_read(friction):
     assert found.kept and any("kept" in line for line in lines)
     for channel, before in found.before.held_out_rmse_windows.items():
         assert found.after.held_out_rmse_windows[channel] < 0.3 * before
+        assert re.search(rf"{channel} [\d.e-]+ -> [\d.e-]+ rad[,;]", str(found))
     (term,) = found.formula.terms
     assert term.name == "sign(w)" and term.coefficient == pytest.approx(-0.03, rel=0.08)
     # The map is the friction less the line that the damper has taken over, mostly within its band.

@@ -20,7 +20,7 @@ from rotflex_jax.effects import (
 from rotflex_jax.errors import InputError
 from rotflex_jax.export import latex, state_space, text
 from rotflex_jax.export.equations import equation
-from rotflex_jax.joints import paper
+from rotflex_jax.joints import paper, xl330_pendulum
 from rotflex_jax.mechanism import simulate, simulate_states
 from rotflex_jax.models.model import Model
 
@@ -89,6 +89,11 @@ def test_memory_has_its_slope_and_friction_is_named():
         "Coulomb friction",
         "input delay",
     ]
+
+
+def test_goal_of_a_servo_is_no_voltage():
+    assert state_space(xl330_pendulum()).inputs == ("input",)
+    assert state_space(paper()).inputs == ("voltage",)
 
 
 def test_quadratic_drag_about_a_speed():

@@ -22,6 +22,7 @@ from rotflex_jax.errors import InputError
 from rotflex_jax.fit.dataset import prepare, process_noise_ports
 from rotflex_jax.fit.plausibility import motion
 from rotflex_jax.mechanism import Mechanism
+from rotflex_jax.mechanism.linear import output_units
 from rotflex_jax.models.model import Model
 from rotflex_jax.recording import Recording
 from rotflex_jax.recording.recording import SHORTEST_TO_FIT, check_apart, listed
@@ -147,10 +148,9 @@ class LearnedTorqueResult:
     def __str__(self) -> str:
         if not self.kept:
             return f"No map of position and speed at the {self.at} makes the validation data likelier."
-        errors = ", ".join(
-            f"{c} {self.before.held_out_rmse_windows[c]:.3g} -> {e:.3g}"
-            for c, e in self.after.held_out_rmse_windows.items()
-        )
+        before, after = self.before.held_out_rmse_windows, self.after.held_out_rmse_windows
+        units = output_units(self.model.mechanism)
+        errors = ", ".join(f"{c} {before[c]:.3g} -> {after[c]:.3g} {unit}" for c, unit in units.items())
         share = f"{100 * self.formula.share:.0f} % of what the map explains"
         return f"Learned torque at the {self.at}: held-out error {errors}; reads {self.reading} ({share})"
 

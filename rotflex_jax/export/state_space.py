@@ -14,6 +14,7 @@ from rotflex_jax.errors import InputError, optional
 from rotflex_jax.mechanism import Mechanism
 from rotflex_jax.mechanism.assembly import Layout, equations, rest_state
 from rotflex_jax.mechanism.linear import state_names, zero_order_hold
+from rotflex_jax.mechanism.quantity import input_word
 from rotflex_jax.mechanism.simulate import read_outputs
 from rotflex_jax.mechanism.step import has_smooth_torques, memory_rates, torques
 from rotflex_jax.models.model import Model
@@ -31,7 +32,8 @@ class LinearModel:
         D: Feedthrough matrix; zero, since the outputs depend on the states only.
         Ts: Sampling period [s]; None for continuous time.
         states: Names of the states.
-        inputs: Names of the inputs: the voltage, then the signals of the recordings that act on the model.
+        inputs: Names of the inputs: `voltage`, or `input` in another unit; then the signals of the
+            recordings that act on the model.
         outputs: Names of the outputs.
         dropped: Effects that the linear model does not contain, one sentence each.
     """
@@ -102,7 +104,7 @@ def state_space(
         Ts: Sampling period [s] of a model in discrete time; None for continuous time.
         positions: Positions of the coordinates; zero if None.
         speeds: Speeds of the coordinates; zero if None.
-        voltage: Voltage at the motor [V].
+        voltage: Voltage at the motor [V], or the input in its unit.
 
     Returns:
         LinearModel.
@@ -131,7 +133,8 @@ def state_space(
 
         x = rest_state(mechanism.structure, np.float64)
         x[: 2 * layout.n] = np.concatenate(point)
-        inputs = ("voltage", *(mechanism.signals if mechanism.takes_signals else ()))
+        word = input_word(mechanism.units.input)
+        inputs = (word, *(mechanism.signals if mechanism.takes_signals else ()))
         u = jnp.asarray([float(voltage), *[0.0] * (len(inputs) - 1)])
         x = _steady_memories(slope, jnp.asarray(x), u, start)
         A, B = (np.asarray(m) for m in jax.jacfwd(slope, argnums=(0, 1))(x, u))
