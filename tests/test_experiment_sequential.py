@@ -355,7 +355,7 @@ def test_a_rig_that_records_in_degrees_or_other_channels_is_refused():
     with pytest.raises(InputError, match="in deg, but the output theta of the model is in rad"):
         e.with_recording(turned)
     other = rf.Recording(u=u, y=y, Ts=0.01, channels=("theta", "beta"), accept=("units",))
-    with pytest.raises(InputError, match="has the channels theta, beta, but the models theta, alpha; record"):
+    with pytest.raises(InputError, match="has the channels theta, beta; name the column of alpha"):
         e.with_recording(other)
 
 

@@ -48,7 +48,7 @@ def from_foreign(
         source: the object.
         channels: names of the outputs, in order.
         units: channel -> unit.
-        Ts: sampling period [s], if the object has none.
+        Ts: sampling period [s]; that of the object if None.
         accept: faults to accept, as in `Recording`.
 
     Returns:
