@@ -9,7 +9,10 @@ import pytest
 import rotflex_jax as rf
 from rotflex_jax.arena.simulator.records import make_record
 from rotflex_jax.cli.app import main
+from rotflex_jax.cli.experiment import _limits
 from rotflex_jax.data.files import save_csv
+from rotflex_jax.errors import InputError
+from rotflex_jax.joints import emps, paper
 
 
 @pytest.fixture(scope="module")
@@ -43,6 +46,15 @@ def test_bad_input_is_one_sentence(run, changes, match, capsys):
     assert called("--fit", run, *changes) == 2
     told = capsys.readouterr().err.strip()
     assert match in told and told.startswith("rotflex: ") and "\n" not in told
+
+
+def test_limits_are_in_degrees_or_millimetres():
+    found = _limits(paper(), 5.0, 90.0, 180.0, 36.0)
+    assert (found.voltage, found.slew) == (5.0, 90.0)
+    assert (found.travel, found.deflection) == pytest.approx((np.pi, np.pi / 5))
+    assert _limits(emps(), 5.0, np.inf, 120.0, np.inf).travel == pytest.approx(0.12)
+    with pytest.raises(InputError, match="--deflection 5 was given, but the model has one output, position;"):
+        _limits(emps(), 5.0, np.inf, 120.0, 5.0)
 
 
 @pytest.mark.parametrize(

@@ -278,9 +278,14 @@ MostSeconds = Annotated[
     float, typer.Option("--max-seconds", metavar="SECONDS", help="Time on the rig at which it stops.")
 ]
 Slew = Annotated[float, typer.Option("--slew", metavar="V/S", help="Fastest change of the voltage.")]
-Travel = Annotated[float, typer.Option("--travel", metavar="DEG", help="Largest servo angle from the start.")]
+Travel = Annotated[
+    float,
+    typer.Option(
+        "--travel", metavar="DEG", help="Largest servo angle from the start, in mm if the machine slides."
+    ),
+]
 Deflection = Annotated[
-    float, typer.Option("--deflection", metavar="DEG", help="Largest deflection of the arm.")
+    float, typer.Option("--deflection", metavar="DEG", help="Largest deflection of the arm, likewise.")
 ]
 Length = Annotated[float, typer.Option(metavar="SECONDS", help="Length of the experiment.")]
 RankOnly = Annotated[bool, typer.Option("--rank-only", help="Rank the standard inputs, design none.")]

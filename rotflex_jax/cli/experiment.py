@@ -14,7 +14,7 @@ from rotflex_jax.cli.recordings import Columns, reads_files
 from rotflex_jax.errors import InputError
 from rotflex_jax.joints import by_name
 from rotflex_jax.text.files import write_file
-from rotflex_jax.text.numbers import digits, readable
+from rotflex_jax.text.numbers import as_read, digits, readable
 
 # Options of the first command of an experiment; later commands take them from its state.
 FIRST_COMMAND = (
@@ -110,7 +110,7 @@ def experiment(
     first, second, *others = (by_name.effect(text) for text in (*between, *(further or ())))
     if (first.name, first.at) == (second.name, second.at):
         raise InputError(f"--between was given {between[0]} twice, but needs two effects; name another.")
-    limits = _limits(voltage, slew, travel, deflection)
+    limits = _limits(model, voltage, slew, travel, deflection)
     recordings = [columns.load(file) for file in fit]
     longest = max(recordings, key=lambda r: r.N)
     if state is None:
@@ -273,11 +273,20 @@ def _write_files(found: Any, save: Path | None, plot: Path | None) -> None:
         write_file(plot, picture.getvalue())
 
 
-def _limits(voltage: float, slew: float, travel: float, deflection: float) -> Any:
-    """Limits, angles given in degrees."""
+def _limits(model: Any, voltage: float, slew: float, travel: float, deflection: float) -> Any:
+    """Limits, angles given in degrees and lengths in millimetres."""
     from rotflex_jax.experiment import Limits
+    from rotflex_jax.mechanism.linear import output_units
+    from rotflex_jax.models.model import Model
 
-    return Limits(voltage, slew, math.radians(travel), math.radians(deflection))
+    units = list((outputs := output_units(Model.of(model).mechanism)).values())
+    if math.isfinite(deflection) and len(units) < 2:
+        raise InputError(
+            f"--deflection {deflection:g} was given, but the model has one output, {', '.join(outputs)}; "
+            "limit it with --travel."
+        )
+    first, second = (as_read(1.0, unit)[0] for unit in (units[0], units[min(1, len(units) - 1)]))
+    return Limits(voltage, slew, travel / first, deflection / second)  # degrees by degrees per radian
 
 
 def _check_length(seconds: float, Ts: float) -> None:
