@@ -345,6 +345,18 @@ def test_a_simulated_rig_has_the_effects_and_the_noise_that_are_asked_for():
         rf.SimulatedRig(dataclasses.replace(gated, gates=(*gated.gates[:-1], 0.5)), LIMITS, 0.01)
 
 
+def test_faults_of_what_a_rig_recorded_are_findings_in_the_result(pair):
+    e, u, rng = pair, np.zeros(0), np.random.default_rng(3)
+    for _ in range(4):
+        e = dataclasses.replace(e, planned=pair.planned)
+        u = np.concatenate([u, pair.planned.u])
+        y = linear_runs(0.02, u)[0][-40:] + 2e-3 * rng.standard_normal(40)
+        y[20:] += 2 * np.pi  # the angle of a sensor that jumps at a whole turn
+        e = e.with_recording(y[:, None])
+    (run,) = e.result().runs
+    assert "wrapped" in [finding.kind for finding in run.findings]
+
+
 def test_a_rig_that_records_in_degrees_or_other_channels_is_refused():
     joint, noise = rf.joints.paper(), {"theta": 1e-3, "alpha": 1e-3}
     models = {"smooth": joint, "rough": joint + rf.effects.Coulomb("hub", level=0.05)}

@@ -28,7 +28,7 @@ from rotflex_jax.experiment.standard_inputs import Limits
 from rotflex_jax.mechanism.quantity import input_word
 from rotflex_jax.models import model_json
 from rotflex_jax.recording import Recording
-from rotflex_jax.recording.quality import SHORTEST_RECORDING
+from rotflex_jax.recording.quality import ACCEPTABLE, SHORTEST_RECORDING
 from rotflex_jax.text.files import write_file
 
 Progress = Callable[[str], None]
@@ -384,7 +384,7 @@ class SequentialExperiment:
                     units=r.units,
                     input_name=input_word(r.structure.units.input),
                     input_unit=r.structure.units.input,
-                    accept=_ANYTHING,
+                    accept=ACCEPTABLE,
                 )
                 for x in self.runs
                 if np.ptp(x.u) > 0 and len(x.u) >= SHORTEST_RECORDING
@@ -393,9 +393,6 @@ class SequentialExperiment:
             reason=self.reason,
             notes=tuple(notes),
         )
-
-
-_ANYTHING = ("constant", "saturated")
 
 
 def _correlation_time(residuals: Sequence[np.ndarray]) -> float:
