@@ -1,6 +1,7 @@
 """`rotflex export`, saved models, and machines from files of users on the command line."""
 
 import json
+import sys
 import textwrap
 
 import numpy as np
@@ -152,6 +153,25 @@ def test_a_machine_of_ones_own_from_a_file(run, plant, tmp_path):
     save(Saved(Model(braked), Ts=0.005), tmp_path / "braked.json")
     text = run("export", tmp_path / "braked.json", "--to", "text", "--with", plant)[1]
     assert "tau = -coefficient * speed**3" in text
+
+
+def test_a_saved_model_with_an_effect_of_ones_own_is_read_with_its_file(run, plant, tmp_path):
+    """The search of a new process may have saved an effect that the next process does not know."""
+    from rotflex_jax.joints.by_name import named
+
+    braked = named(f"{plant}:braked").mechanism
+    u = 2 * np.sin(np.arange(400) * 0.02) + 0.3
+    table = np.column_stack([0.005 * np.arange(len(u)), u, simulate(braked, u, 0.005)[:, 0]])
+    data, model = tmp_path / "run.csv", tmp_path / "braked.json"
+    np.savetxt(data, table, delimiter=",", header="t,voltage,tacho", comments="", fmt="%.17g")
+    save(Saved(Model(braked), Ts=0.005), model)
+    # As in a new process: the catalogue and the modules do not know the file.
+    del CATALOG["plant_drag"], sys.modules["my_plant"]
+    status, out, err = run("simulate", data, "--model", model)
+    assert (status, out) == (2, "")
+    one_sentence(err, "'plant_drag', which is not in the catalogue", "--with FILE.py")
+    status, out, _ = run("simulate", data, "--model", model, "--with", plant)
+    assert status == 0 and "tacho 100.0 %" in out
 
 
 def test_mistakes_in_naming_ones_own_machine(run, plant, saved, tmp_path):

@@ -15,6 +15,7 @@ from rotflex_jax.cli.arguments import (
     InputColumn,
     Intersample,
     OutputColumns,
+    OwnEffects,
     Resample,
     SamplingPeriod,
     Signals,
@@ -23,6 +24,7 @@ from rotflex_jax.cli.arguments import (
     TimeUnit,
 )
 from rotflex_jax.errors import InputError
+from rotflex_jax.joints.by_name import imported
 
 if TYPE_CHECKING:
     from rotflex_jax.models.model import Model
@@ -210,19 +212,25 @@ Command = Callable[..., None]
 
 
 def reads_files(command: Command) -> Command:
-    """A command with the options that state how to read files, which make its argument `columns`."""
-    options = {f.name: f for f in dataclasses.fields(Columns) if f.name != "mechanism"}
-    types = {name: f.type for name, f in options.items()}
+    """A command with the options that state how to read files, which make its argument `columns`.
+
+    It also imports the files of `--with`, since a saved model and a search may have effects of the user.
+    """
+    reading = {f.name: f for f in dataclasses.fields(Columns) if f.name != "mechanism"}
+    types = {name: f.type for name, f in reading.items()} | {"effects": OwnEffects}
+    defaults = {name: f.default for name, f in reading.items()} | {"effects": None}
 
     @functools.wraps(command)
     def inside(**arguments: Any) -> None:
-        command(columns=Columns(**{name: arguments.pop(name) for name in options}), **arguments)
+        for file in arguments.pop("effects") or []:
+            imported(file)
+        command(columns=Columns(**{name: arguments.pop(name) for name in reading}), **arguments)
 
     own = inspect.signature(command, eval_str=True)
     before = [p for p in own.parameters.values() if p.name != "columns"]
     added = [
-        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=f.default, annotation=f.type)
-        for name, f in options.items()
+        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=defaults[name], annotation=type_)
+        for name, type_ in types.items()
     ]
     listed = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in before] + added
     inside.__signature__ = own.replace(parameters=listed)  # pyright: ignore[reportAttributeAccessIssue]
