@@ -1,10 +1,12 @@
 """Properties of every effect, and the law of each one against a closed form."""
 
 import ast
+import contextlib
 import dataclasses
 import inspect
 import json
 import math
+import re
 from pathlib import Path
 from typing import ClassVar
 
@@ -152,6 +154,72 @@ def law(effect: Effect, numbers, position, speed, voltage, z):
         said = [effect.measure(position, *beside(effect, speed, z))]
         said += entries(effect) if effect.order else []
     return jnp.stack([jnp.asarray(s, position.dtype) for s in said])
+
+
+def by_its_equation(effect: Effect, known: dict[str, float]) -> dict[str, float]:
+    """What the text `equation` of an effect defines, evaluated by Python with the values in `known`."""
+    text = re.sub(r"\|([^|]+)\|", r"abs(\1)", effect.equation.replace("^", "**").replace("dz/dt", "flow"))
+    # Parts are separated by commas that are in no parentheses; parts without a sign are words.
+    parts = [re.split(" (?:=|->) ", part) for part in re.split(r", (?![^()]*\))", text)]
+    formulas = [(part[0], part[1]) for part in parts if len(part) == 2]
+    functions = {"min": min, "max": max, "abs": abs, "sign": np.sign}
+    functions |= {name: getattr(np, name) for name in ("exp", "sin", "cos", "tanh")}
+    found = known | effect.values
+    # A formula may use what a later one defines.
+    for symbol, formula in formulas * len(formulas):
+        with contextlib.suppress(NameError):
+            found[symbol] = eval(formula, functions | found)
+    return found
+
+
+# Effects whose equations are formulas throughout, without conditions in words.
+WRITTEN_OUT = (
+    "amplifier_saturation",
+    "bouc_wen",
+    "cogging",
+    "cross_talk",
+    "cubic_spring",
+    "current_meter",
+    "dahl",
+    "eccentric_encoder",
+    "gravity",
+    "heating",
+    "joint_play",
+    "lugre",
+    "pid_servo",
+    "quadratic_drag",
+    "quadratic_spring",
+    "saturation",
+    "sensor_bias",
+    "sensor_cubic",
+    "sensor_gain",
+    "torque_saturation",
+    "viscous_asymmetric",
+)
+
+
+@pytest.mark.parametrize("name", WRITTEN_OUT)
+def test_the_equation_that_is_shown_is_the_law(name):
+    effect = example(CATALOG[name])
+    for sign in (1.0, -1.0):
+        position, speed, other, z = 0.31 * sign, -0.27, 0.43 * sign, 0.19
+        # The equations call the last argument of a law by different names.
+        said = {"position": position, "speed": speed, "z": z, "value": position, "other": other}
+        said |= dict.fromkeys(("v", "m", "i"), other)
+        told = by_its_equation(effect, said)
+        if isinstance(effect, Sensing):
+            laws = {"y": effect.measure(position, *beside(effect, other, z))}
+        elif isinstance(effect, Actuation):
+            laws = {"v": effect.drive(jnp.array([other]), 0.002)[0]}
+        elif isinstance(effect, Memory):
+            laws = {"flow": effect.flow(z, position, speed, other)}
+            if not isinstance(effect, Linear):
+                laws["tau"] = effect.force(z, position, speed, other)
+        else:
+            assert isinstance(effect, Force)
+            laws = {"tau": effect.force(position, speed, other)}
+        for symbol, value in laws.items():
+            assert told[symbol] == pytest.approx(float(value), rel=1e-12), symbol
 
 
 def entries(effect: Linear | Sensing) -> list:

@@ -17,9 +17,10 @@ class Viscous(Linear):
 
         tau = -coefficient speed
 
-    The coefficient has no bound: it adds to the damping of the motor, and is estimated as negative if
-    the trusted back-EMF constant is too large. Not for friction that is as large at low speed as at high
-    speed: that is Coulomb friction.
+    The coefficient adds to the damping by the back-EMF of a motor at the port, and is estimated as negative
+    if the trusted back-EMF constant is too large. A fit lets it fall below zero by no more than other effects
+    damp its port. So at a port without a motor the least estimate is zero, while a model may be given any
+    coefficient. Not for friction that is as large at low speed as at high speed: that is Coulomb friction.
 
     Args:
         at: Port.

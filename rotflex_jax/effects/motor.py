@@ -487,11 +487,11 @@ class PidServo(PositionLoop, Memory):
         duty = min(max(wanted, -limit), limit)
         dz/dt = integral band(e) - anti_windup (wanted - duty)
 
-    The motor, `band` and the other optional parts are those of `PositionServo`. The state `z` is the duty of
-    the I gain. While the duty is at its limit, the duty beyond the limit is fed back to the integral
-    (back-calculation), as in the firmware of a Dynamixel X. Its manual shows an anti-windup gain without a
-    value: release `anti_windup` if a log reaches the limit. A large value keeps the integral from growing at
-    the limit.
+    The motor, `band` and the other optional parts are those of `PositionServo`; `enabled` multiplies `dz/dt`
+    too. The state `z` is the duty of the I gain. While the duty is at its limit, the duty beyond the limit is
+    fed back to the integral (back-calculation), as in the firmware of a Dynamixel X. Its manual shows an
+    anti-windup gain without a value: release `anti_windup` if a log reaches the limit. A large value keeps
+    the integral from growing at the limit.
 
     The step treats the I part as a torque that is linear in time over the step; the rest of the loop is exact
     below the limit. Not for a servo without an I gain: `PositionServo` has one state less.
@@ -520,11 +520,10 @@ class PidServo(PositionLoop, Memory):
     title: ClassVar[str] = "motor under a PID position loop"
     equation: ClassVar[str] = (
         "tau = torque_constant / resistance * (supply * duty - torque_constant * speed), "
-        "duty = min(max(wanted, -limit), limit), "
-        "wanted = gain * gain_scale * (v - position + period / 2 * speed) + z, "
-        "dz/dt = integral * (v - position) - anti_windup * (wanted - duty), "
-        "where given, dead_band off the error, derivative * speed off wanted, source_resistance * duty * "
-        "current off the supply, enabled times tau"
+        "duty = min(max(wanted, -limit), limit), wanted = gain * gain_scale * e + z, "
+        "e = v - position + period / 2 * speed, dz/dt = integral * e - anti_windup * (wanted - duty), "
+        "where given, dead_band off e, derivative * speed off wanted, source_resistance * duty * "
+        "current off the supply, enabled times tau and dz/dt"
     )
     state_part: ClassVar[StatePart | None] = "memory"
 
