@@ -412,6 +412,8 @@ def test_several_models_have_one_next_experiment(tmp_path):
     assert s.rivals == ("nothing more", "coulomb@hub", "quadratic_drag@hub")
     assert len(s.u) == 200 and np.max(np.abs(s.u)) <= 2.0 and s.peaks["theta"] <= 0.9 * 1.5
     assert s.table[0][2] >= s.table[1][2] > 0 and 0 < s.expected_error < 2 / 3 + 1e-12
+    for repeats, said in ((1.0, "after 2 s of it a wrong"), (2.5, "after 5 s of it, repeated, a wrong")):
+        assert said in str(dataclasses.replace(s, repeats=repeats))
     back = np.loadtxt(s.save_csv(tmp_path / "next.csv"), delimiter=",", skiprows=2)
     np.testing.assert_array_equal(back[:, 1], s.u)
     assert {"voltage [V]", "theta [mrad]"} <= {ax.get_ylabel() for ax in s.plot().axes}

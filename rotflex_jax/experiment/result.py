@@ -285,11 +285,11 @@ class Segment:
 
     def __str__(self) -> str:
         unit, peaks = self.input_unit, _predicted(self.peaks, self.units)
+        seconds = len(self.u) * self.Ts
+        ahead = f"{self.repeats * seconds:g} s of it" + (", repeated," if self.repeats > 1 else "")
         return (
-            f"To tell {', '.join(self.rivals)} apart: {self.input}, {self.setting}, "
-            f"{len(self.u) * self.Ts:g} s\n"
-            f"  after {self.repeats:g} of it a wrong answer has at most the probability "
-            f"{self.expected_error:.2g}\n"
+            f"To tell {', '.join(self.rivals)} apart: {self.input}, {self.setting}, {seconds:g} s\n"
+            f"  after {ahead} a wrong answer has at most the probability {self.expected_error:.2g}\n"
             f"  {input_word(unit)} to {np.max(np.abs(self.u)):.3g} {unit}, {peaks} predicted; "
             f"best of {self.tried} inputs"
         )
