@@ -45,6 +45,9 @@ def local_kernels(
     slides at a constant voltage has the slope of the joint without friction. With such effects,
     identification from data finds `average_kernels`.
 
+    The kernels are those of the simulation. At a long sampling period its default, one step per sample, is
+    accurate for linear effects only: give `Model(joint, Exponential(order=4, substeps=16))` then.
+
     Args:
         model: Mechanism, or a model with its own integration rule and gates.
         Ts: Sampling period [s]; the voltage is held between samples.
