@@ -182,7 +182,7 @@ def compare(
 def effects(
     as_json: given.AsJson = False,
 ) -> None:
-    """List the effects that the search knows, with equations and parameters."""
+    """List the effects of the catalogue, with equations and parameters."""
     from rotflex_jax.effects import CATALOG
 
     descriptions = [kind.describe() for kind in CATALOG.values()]
