@@ -351,4 +351,5 @@ def test_bad_input_is_named():
         with pytest.raises(InputError, match="`bins` must be a whole number from 1"):
             found.curve("hub", bins=bins)
     assert "hub" in str(found) and "nat" in str(found)
+    assert " 0 nat" in str(dataclasses.replace(found, gain_nats=dict.fromkeys(found.ports, -0.2)))
     assert sensor_noise([r], Model(paper()))[0] > 0

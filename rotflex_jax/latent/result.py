@@ -329,7 +329,8 @@ class LatentTorque:
 
     def __str__(self) -> str:
         lines = ["Latent torque, root mean square and log-likelihood it gains"]
-        lines += [f"  {p}: {self.size(p):.3g} {self.effort}, {self.gain_nats[p]:.0f} nat" for p in self.ports]
+        for port in self.ports:  # `z`: a gain that rounds to zero has no sign
+            lines.append(f"  {port}: {self.size(port):.3g} {self.effort}, {self.gain_nats[port]:z.0f} nat")
         return "\n".join([*lines, *(f"  {sentence}" for sentence in self.in_time())])
 
 
