@@ -388,7 +388,7 @@ def controller(
     for column in torque_at.values():
         Q[:size, :size] += (WHITE_SHARE * stall) ** 2 * Ts * process_covariance(A, column[n : 2 * n], n, Ts)
     Q[size, size] = (LOAD_PER_SECOND * stall) ** 2 * Ts
-    counters = balance if compensate in ("observer", "both") else 0.0
+    gain_of_load = -balance if compensate in ("observer", "both") else 0.0
     return Controller(
         model=model,
         Ts=Ts,
@@ -398,7 +398,7 @@ def controller(
         A=full,
         B=np.append(Bd, 0.0),
         C=C,
-        K=np.append(K, -counters),
+        K=np.append(K, gain_of_load),
         L=_observer(full, C, Q, np.diag(step**2 / 12)),
         row=row,
         push=push,
