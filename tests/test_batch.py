@@ -95,6 +95,17 @@ def test_recordings_in_memory_are_as_good_as_files(files, serial, tmp_path) -> N
     ]
 
 
+def test_files_are_read_in_the_units_of_the_machine(files, tmp_path) -> None:
+    """A column that is named for the goal of a servo holds the goal; that of the voltage is refused."""
+    how = {"workers": 0, "search": batch_search.quick, "outputs": "theta"}
+    goal = tmp_path / "goal.csv"
+    goal.write_text(files[0].read_text().replace("voltage", "goal"))
+    named = fleet(rf.joints.servo(), [goal], folder=tmp_path / "a", input="goal", **how)
+    assert named.rows[0].verdict == "nothing_missing"
+    unnamed = fleet(rf.joints.servo(), files[:1], folder=tmp_path / "b", **how)
+    assert "'voltage' is in V, but the model is driven in rad" in unnamed.rows[0].reason
+
+
 def test_a_second_call_repeats_only_what_has_changed(files, serial, tmp_path) -> None:
     said: list[str] = []
     again = functools.partial(

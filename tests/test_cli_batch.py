@@ -3,6 +3,7 @@
 import functools
 import importlib
 import json
+import shlex
 from collections.abc import Callable
 from pathlib import Path
 
@@ -33,7 +34,7 @@ def run(
 
     def run(line: str) -> tuple[int, str, str]:
         with pytest.raises(SystemExit) as left:
-            app.main(line.split())
+            app.main(shlex.split(line))
         assert isinstance(left.value.code, int)
         return left.value.code, *capsys.readouterr()
 
@@ -109,6 +110,40 @@ def test_bad_arguments_are_refused_with_one_sentence(line, run) -> None:
     assert "Traceback" not in err
     if "No search" not in sentence:
         assert not Path("rotflex-each").exists()
+
+
+OTHER_UNITS = {
+    "t,voltage [A],theta,alpha": ("--degrees", "the input 'voltage' is in A, but the model is driven in V"),
+    "t,voltage,theta [rev],alpha": (
+        '--output "theta [rev]=theta" --output alpha=alpha',
+        "the output 'theta' is in rev, but that of the model is in rad",
+    ),
+}
+
+
+@pytest.mark.parametrize("header", OTHER_UNITS)
+def test_each_refuses_a_file_that_one_search_refuses(header, run) -> None:
+    """The same sentence, with the name of the file."""
+    rows = Path("run_1.csv").read_text().partition("\n")[2]
+    Path("other.csv").write_text(f"{header}\n{rows}")
+    options, fault = OTHER_UNITS[header]
+    status, _, err = run(f"discover other.csv {options}")
+    sentence = err.strip().removeprefix("rotflex: ")
+    assert status == 2 and sentence.startswith(f"other.csv: {fault}") and "--accept units" in sentence
+    status, _, err = run(f"discover other.csv --each --workers 0 {options}")
+    assert status == 2 and err.strip().endswith(sentence)
+    assert run(f"discover other.csv --each --workers 0 --accept units {options}")[0] == 0
+
+
+def test_each_recording_of_a_public_data_set_is_searched(run, monkeypatch) -> None:
+    from rotflex_jax.data import datasets, load
+
+    runs = [load(f"run_{k}.csv", degrees=True) for k in range(2)]
+    monkeypatch.setattr(datasets, "load_dataset", {"rotflex": runs}.get)
+    assert run("discover rotflex run_2.csv --each --workers 0 --degrees")[0] == 2  # not for a data set
+    status, out, _ = run("discover rotflex --each --workers 0")
+    rows = [line.split()[0] for line in out.splitlines() if line.startswith("run_")]
+    assert status == 0 and rows == ["run_0", "run_1"]
 
 
 def test_each_file_has_its_page_and_the_summary_links_to_it(run, monkeypatch) -> None:

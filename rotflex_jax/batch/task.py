@@ -25,6 +25,7 @@ from rotflex_jax.discover.explanation import Explanation, remaining_failures
 from rotflex_jax.effects import CATALOG
 from rotflex_jax.errors import InputError
 from rotflex_jax.joints.by_name import imported
+from rotflex_jax.mechanism.linear import check_units_of_file
 from rotflex_jax.models.model import Model
 from rotflex_jax.recording import Recording
 from rotflex_jax.runtime.xla import enable_fast_start
@@ -191,7 +192,11 @@ def _searched(task: SearchTask) -> Any:
         imported(place)
     model, search = pickle.loads(task.what)
     source = task.source
-    recording = source if isinstance(source, Recording) else load(source, **task.reading)
+    if isinstance(source, Recording):
+        recording = source
+    else:
+        recording = load(source, **task.reading)
+        check_units_of_file(model.mechanism, recording)
     found = search(model, *recording.split(task.share))
     return {"result": found.to_dict(), "model": _model(found), "page": _page(found) if task.pages else None}
 

@@ -383,6 +383,7 @@ def as_options(sentence: str) -> str:
     sentence = re.sub(r"(?<!--set )\b(input|time|Ts|counts)=(?=\d)", r"--\1 ", sentence)
     sentence = re.sub(r"\boutputs=\{'(\w+)': 'COLUMN'\}", r"--output \1=COLUMN", sentence)
     sentence = sentence.replace("import the module that registers it first", "name its file, --with FILE.py")
+    sentence = re.sub(r"\bsignals=\{'([^']+)': 'COLUMN'\}", r'--signal "\1=COLUMN"', sentence)
     sentence = sentence.replace("model.with_values({...})", "--joint paper:stiffness=1.2")
     sentence = re.sub(r"(?<!--set )\b(input|time|Ts)=", r"--\1", sentence)
     sentence = re.sub(r"\boutputs=|Argument `outputs`", "--output", sentence)

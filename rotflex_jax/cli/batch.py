@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from rotflex_jax.cli import arguments as given, terminal
-from rotflex_jax.cli.recordings import Columns
+from rotflex_jax.cli.recordings import Columns, public_name
 from rotflex_jax.errors import InputError
 from rotflex_jax.text.files import write_file
 
@@ -42,7 +42,7 @@ def search_each(
     workers: int | None,
     calibrate_seconds: float = 2.0,
 ) -> None:
-    """Search every file, write the summary, show it."""
+    """Search every file, and every recording of a public data set, write the summary, show it."""
     from rotflex_jax.batch import fleet
     from rotflex_jax.discover import discover
     from rotflex_jax.runtime.xla import enable_fast_start
@@ -52,12 +52,17 @@ def search_each(
     options: dict[str, Any] = {}
     if calibrate_seconds != usual:
         options["search"] = functools.partial(discover, calibrate_seconds=calibrate_seconds)
+    sources = [
+        source
+        for file in files
+        for source in ([file] if public_name(file) is None else columns.load_all([file]))
+    ]
     if workers == 0:
         enable_fast_start()  # this process then does the work
     with terminal.progress("Searching") as step:
         result = fleet(
             model,
-            files,
+            sources,
             folder=folder or SUMMARY_FOLDER,
             scheduler=scheduler,
             workers=workers,
@@ -67,9 +72,9 @@ def search_each(
             **options,
             **columns.reading(),
         )
-    if len(result.failed) == len(files):
+    if len(result.failed) == len(sources):
         raise InputError(
-            f"No search of {len(files)} gave an answer; the first, {result.rows[0].name}: "
+            f"No search of {len(sources)} gave an answer; the first, {result.rows[0].name}: "
             f"{result.rows[0].reason}"
         )
     text = json.dumps(result.to_dict(), indent=2)

@@ -101,40 +101,15 @@ class Columns:
         return model, dataclasses.replace(self, mechanism=model.mechanism)
 
     def load(self, file: Path) -> "Recording":
-        """The recording in a file, in the units of the model.
-
-        `Model.measured` refuses an angle in degrees for radians alone, since a recording made in Python may
-        name its units as it likes. Here any other unit is refused: a file is read by those of the model.
-        """
+        """The recording in a file, in the units of the model."""
         if not file.exists():
             raise InputError(f"{file} does not exist; give the path of a recording.")
         from rotflex_jax.data import load
-        from rotflex_jax.mechanism.linear import output_units
+        from rotflex_jax.mechanism.linear import check_units_of_file
 
         recording = load(file, **self.reading())
-        driven = "" if self.mechanism is None else self.mechanism.units.input
-        if driven and recording.input_unit != driven and "units" not in recording.accept:
-            raise InputError(
-                f"{recording.source}: the input {recording.input_name!r} is in {recording.input_unit}, but "
-                f"the model is driven in {driven}; name the column of that with --input, give a model with "
-                "such an input (--model FILE.py:NAME, for a current one with CurrentDrive), or "
-                "--accept units."
-            )
-        for channel, unit in ({} if self.mechanism is None else output_units(self.mechanism)).items():
-            given = recording.unit(channel) if channel in recording.channels else unit
-            if given != unit and "units" not in recording.accept:
-                raise InputError(
-                    f"{recording.source}: the output {channel!r} is in {given}, but that of the model is in "
-                    f"{unit}; convert the column, or --accept units."
-                )
-        driving = () if self.mechanism is None else self.mechanism.signals
-        lacking = next((name for name in driving if name not in recording.signals), None)
-        if lacking is not None:
-            raise InputError(
-                f"{recording.source}: the model is driven by the signal {lacking!r} beside its input, but "
-                f"--signal names {' and '.join(map(repr, recording.signals))}; name its column, --signal "
-                f'"{lacking}=COLUMN".'
-            )
+        if self.mechanism is not None:
+            check_units_of_file(self.mechanism, recording)
         return recording
 
     def reading(self) -> dict[str, Any]:
@@ -142,12 +117,10 @@ class Columns:
         from rotflex_jax.data.columns import named_outputs
         from rotflex_jax.mechanism.linear import units_to_read
 
-        units = {} if self.mechanism is None else units_to_read(self.mechanism)
+        units = {} if self.mechanism is None else units_to_read(self.mechanism, self.input)
         channels, told = _channels(self.outputs or (), self.mechanism.channels if self.mechanism else ())
-        units = {c: unit for c, unit in units.items() if c in named_outputs(channels)} | told
-        # Without --input the column of the voltage is read, which is not the input of such a model.
-        if self.input is not None and self.mechanism is not None and self.mechanism.units.input != "V":
-            units |= {self.input: self.mechanism.units.input}
+        named = (*named_outputs(channels), self.input)
+        units = {name: unit for name, unit in units.items() if name in named} | told
         return {
             "input": self.input,
             "outputs": channels,
