@@ -182,6 +182,18 @@ REFUSED = {
     "simulate {run} --add coulomb@hub --add coulomb@hub": "coulomb",
     "simulate {run} --fit {run}": "twice",
     "simulate {run} --save {tmp}/missing/s.csv": "missing",
+    "simulate {run} --save {run}": "would be written over {run}, which this command reads",
+    "simulate {run} --save-model {tmp}/../{tmp.name}/run.csv": "would be written over",
+    "simulate {run} --fit {tmp}/other.csv --save {tmp}/other.csv": "other.csv, which this command reads",
+    "simulate {run} --save {tmp}/a --save-model {tmp}/a": "reads or writes already",
+    "discover {run} --json {run}": "would be written over",
+    "discover {run} --held-out {tmp}/other.csv --save-model {tmp}/other.csv": "would be written over",
+    "discover {run} --each --json {run}": "would be written over",
+    "compare {run} --json {run}": "would be written over",
+    "reproduce --data {run} --json {run}": "would be written over",
+    "experiment --fit {run} --between delay@input lag@input --voltage 6 --save {run}": "be written over",
+    "export {tmp}/a.json --to text --out {tmp}/a.json": "would be written over",
+    "arena {tmp}/a.py:f --json {tmp}/a.py": "would be written over",
     "data fetch nothing_of_this_name": "nothing_of_this_name",
     "data fetch": "NAME",
     "dicsover {run}": "dicsover",
@@ -199,11 +211,11 @@ def test_bad_arguments_are_refused_with_one_sentence(line, run, recorded, tmp_pa
     (tmp_path / "text.csv").write_text("t,voltage,theta,alpha\n" + "a,b,c,d\n" * 100)
     for name in ("noise.mat", "noise.npz"):
         (tmp_path / name).write_bytes(np.random.default_rng(0).bytes(500))
-    before = sorted(tmp_path.iterdir())
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
     status, out, err = run(*line.format(run=recorded, tmp=tmp_path).split())
     assert (status, out) == (2, "")
-    assert_one_sentence(err, REFUSED[line])
-    assert sorted(tmp_path.iterdir()) == before
+    assert_one_sentence(err, REFUSED[line].format(run=recorded))
+    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
 def test_a_folder_for_a_report_is_tried_and_left_as_it_was(tmp_path, monkeypatch) -> None:

@@ -123,7 +123,9 @@ def discover(
     refused = {"held-out": held_out, "test": test, "save-model": save_model, "continue": resume}
     check_each(each, {"scheduler": scheduler, "workers": workers}, refused)
     share = given.check_split(split, held_out or [])
-    given.check_distinct(files, [*(held_out or []), *(test or [])])
+    unseen = [*(held_out or []), *(test or [])]
+    given.check_distinct(files, unseen)
+    given.check_overwritten([*files, *unseen, *([resume] if resume else [])], [json_file, save_model])
     given.check_writable(json_file=json_file, folder=report)
     given.check_writable(json_file=save_model)
     model, columns = columns.of(by_name.model(joint_for(files, given.one_model(joints), columns)))
@@ -154,6 +156,7 @@ def compare(
     """Compare methods on the same data by their free runs over held-out data."""
     share = given.check_split(split, held_out or [])
     given.check_distinct(files, held_out or [])
+    given.check_overwritten([*files, *(held_out or [])], [json_file])
     given.check_writable(json_file=json_file, folder=report)
     if quick and methods is not None:
         raise InputError(

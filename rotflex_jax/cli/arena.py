@@ -20,6 +20,7 @@ def arena(
     json_file: given.JsonFile = None,
 ) -> None:
     """Score methods, your own or the arena's, on records whose truth none of them sees."""
+    given.check_overwritten([Path(m.partition(":")[0]) for m in methods or []], [report, json_file])
     for file in (report, json_file):
         given.check_writable(json_file=file)
     if report == given.STDOUT:

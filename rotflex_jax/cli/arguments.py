@@ -405,6 +405,21 @@ def check_distinct(files: Sequence[Path], held_out: Sequence[Path]) -> None:
         seen[place] = file
 
 
+def check_overwritten(read: Sequence[Path], written: Sequence[Path | None]) -> None:
+    """Refuse an output file that would replace a file that is read, or another output."""
+    taken = {os.path.realpath(file) for file in read}
+    for file in written:
+        if file in (None, STDOUT):
+            continue
+        place = os.path.realpath(file)
+        if place in taken:
+            raise InputError(
+                f"An output would be written over {file}, which this command reads or writes already; name "
+                "another file for it."
+            )
+        taken.add(place)
+
+
 def check_split(split: float | None, held_out: Sequence[Path]) -> float:
     """The share of each file to fit."""
     if split is None:

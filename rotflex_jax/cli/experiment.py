@@ -86,6 +86,7 @@ def experiment(
     if further and state is None:
         raise InputError("--or was given, but more than two are told apart with --state only; add it.")
     given.check_distinct(fit, [])
+    given.check_overwritten(fit, [save, plot, json_file, state])
     for file in (save, plot, json_file, state):
         given.check_writable(json_file=file)
     if state is not None:
@@ -209,6 +210,7 @@ def _continued(
             "--continue was given with an option of the first command (as --fit, --between, --voltage or "
             "--travel), but the state has these; leave them out."
         )
+    given.check_overwritten([state, recording], [save, json_file])
     for file in (save, json_file):
         given.check_writable(json_file=file)
     if save == given.STDOUT:

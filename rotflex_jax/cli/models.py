@@ -24,6 +24,7 @@ def simulate(
 ) -> None:
     """Simulate a recording in free run and compare with what was measured."""
     given.check_distinct([file], fit or [])
+    given.check_overwritten([file, *(fit or [])], [save, save_model])
     for target in (save, save_model):
         given.check_writable(json_file=target)
     given.check_writable(folder=report)
@@ -83,6 +84,7 @@ def export(
 ) -> None:
     """Give a model as C code, as equations, as state space or for a simulator, or a controller of it in C."""
     form = by_name.choose(to, given.EXPORT_FORMS, "form of export")
+    given.check_overwritten([Path(model.partition(":")[0])], [out])
     given.check_writable(json_file=out)
     if form == "fmu" and out in (None, given.STDOUT):
         raise InputError("An FMU is an archive, which is not shown as text; give --out FILE.fmu.")

@@ -48,6 +48,7 @@ def reproduce(
             "--signal was given, but the experiment of the paper has its input alone; leave it out."
         )
     share = given.check_split(split, held_out or [])
+    given.check_overwritten([*map(Path, data or []), *(held_out or [])], [json_file])
     given.check_writable(json_file=json_file, folder=out)
     joint = given.one_model(joints)
     mechanism = by_name.joint(joint)
