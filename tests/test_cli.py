@@ -194,6 +194,13 @@ REFUSED = {
     "experiment --fit {run} --between delay@input lag@input --voltage 6 --save {run}": "be written over",
     "export {tmp}/a.json --to text --out {tmp}/a.json": "would be written over",
     "arena {tmp}/a.py:f --json {tmp}/a.py": "would be written over",
+    "simulate {run} --save -": "only --json goes to stdout",
+    "discover {run} --save-model -": "only --json goes to stdout",
+    "arena {tmp}/a.py:f --report -": "only --json goes to stdout",
+    "export paper --to text --Ts 0.002": "--Ts was given, but text has no use of it; leave it out",
+    "export paper --to statespace --prefix a": "--prefix was given, but statespace has",
+    "export paper --to text --length 0.1": "--length was given",
+    "export paper --to c --Ts 0.002 --actuator a": "--actuator was given",
     "data fetch nothing_of_this_name": "nothing_of_this_name",
     "data fetch": "NAME",
     "dicsover {run}": "dicsover",
@@ -311,6 +318,11 @@ def test_simulate_tells_errors_and_saves(run, recorded, tmp_path) -> None:
     assert "theta [deg]" in out
     header, *rows = saved.read_text().splitlines()
     assert header == "t,voltage,theta,alpha,theta_simulated,alpha_simulated"
+    slide = write(tmp_path / "slide.csv", DEMO[:, :3], ("t", "force [N]", "x [m]"))
+    moved = rf.load(slide, input="force", outputs={"x": "x [m]"}, units={"x": "m"})
+    terminal.save_simulation(tmp_path / "moved.csv", moved, {"x": moved.y[:, 0]})
+    header = (tmp_path / "moved.csv").read_text().splitlines()[0]
+    assert header == "t,force [N],x [m],x_simulated [m]"  # in other units than a reader would assume
     table = np.array([row.split(",") for row in rows], dtype=float)
     np.testing.assert_allclose(table[:, :4], DEMO, atol=1e-8)
     recording = rf.load(recorded)

@@ -40,7 +40,10 @@ WRITERS: dict[str, tuple[Callable[[Path], object], str]] = {
     "recording": (lambda folder: save_csv(RUN, folder / "run.csv"), "run.csv"),
     "model": (lambda folder: Model(rf.joints.paper()).save(folder / "model.json"), "model.json"),
     "input": (lambda folder: Experiment.save_csv(INPUT, folder / "input.csv"), "input.csv"),
-    "simulation": (lambda folder: terminal.save_simulation(folder / "sim.csv", RUN, {"y": K}), "sim.csv"),
+    "simulation": (
+        lambda folder: terminal.save_simulation(folder / "sim.csv", RUN, {"theta": K}),
+        "sim.csv",
+    ),
     "report": (lambda folder: write_files(folder, {"index.html": "<html>"}), "index.html"),
     "summary": (lambda folder: Fleet((ROW,), 1, {"theta": "rad"}, folder, 0.0).write(), "summary.csv"),
     "row": (

@@ -91,7 +91,7 @@ def _start(
 
 def demo(report: given.ReportFolder = Path("rotflex-demo"), json_file: given.JsonFile = None) -> None:
     """Show the loop on a recording that comes with the package, up to its report."""
-    given.check_writable(json_file=json_file, folder=report)
+    given.check_writable(or_stdout=json_file, folder=report)
     from rotflex_jax.data.datasets import demo_recording
 
     train, test = demo_recording().split(0.7)
@@ -126,8 +126,7 @@ def discover(
     unseen = [*(held_out or []), *(test or [])]
     given.check_distinct(files, unseen)
     given.check_overwritten([*files, *unseen, *([resume] if resume else [])], [json_file, save_model])
-    given.check_writable(json_file=json_file, folder=report)
-    given.check_writable(json_file=save_model)
+    given.check_writable(save_model, or_stdout=json_file, folder=report)
     model, columns = columns.of(by_name.model(joint_for(files, given.one_model(joints), columns)))
     if each:
         search_each(model, files, columns, share, report, json_file, scheduler, workers, calibrate)
@@ -157,7 +156,7 @@ def compare(
     share = given.check_split(split, held_out or [])
     given.check_distinct(files, held_out or [])
     given.check_overwritten([*files, *(held_out or [])], [json_file])
-    given.check_writable(json_file=json_file, folder=report)
+    given.check_writable(or_stdout=json_file, folder=report)
     if quick and methods is not None:
         raise InputError(
             "Options --quick and --methods were both given, but each says which methods to run; give one."

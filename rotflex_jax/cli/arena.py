@@ -21,10 +21,7 @@ def arena(
 ) -> None:
     """Score methods, your own or the arena's, on records whose truth none of them sees."""
     given.check_overwritten([Path(m.partition(":")[0]) for m in methods or []], [report, json_file])
-    for file in (report, json_file):
-        given.check_writable(json_file=file)
-    if report == given.STDOUT:
-        raise InputError("--report was given as -, but only --json goes to stdout; name the file.")
+    given.check_writable(report, or_stdout=json_file)
     optional("numba", "The simulator of the arena")
     from rotflex_jax.arena.entrants import ENTRANTS
 

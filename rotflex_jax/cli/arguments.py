@@ -437,13 +437,23 @@ def check_split(split: float | None, held_out: Sequence[Path]) -> float:
     return split
 
 
-def check_writable(*, json_file: Path | None = None, folder: Path | None = None) -> None:
-    """Refuse an output file or folder that cannot be written, before anything is computed."""
-    if json_file not in (None, STDOUT):
-        if json_file.is_dir():
-            raise InputError(f"{json_file} is a folder, but a file is written; name the file.")
-        if not json_file.absolute().parent.is_dir():
-            raise without_folder(json_file)
+def check_writable(*files: Path | None, or_stdout: Path | None = None, folder: Path | None = None) -> None:
+    """Refuse an output file or folder that cannot be written, before anything is computed.
+
+    Args:
+        files: Output files.
+        or_stdout: Output file that may be `STDOUT`.
+        folder: Output folder.
+    """
+    if STDOUT in files:
+        raise InputError("A file was given as -, but only --json goes to stdout; name the file.")
+    for file in (*files, or_stdout):
+        if file in (None, STDOUT):
+            continue
+        if file.is_dir():
+            raise InputError(f"{file} is a folder, but a file is written; name the file.")
+        if not file.absolute().parent.is_dir():
+            raise without_folder(file)
     if folder is not None:
         _check_folder(folder)
 

@@ -87,8 +87,7 @@ def experiment(
         raise InputError("--or was given, but more than two are told apart with --state only; add it.")
     given.check_distinct(fit, [])
     given.check_overwritten(fit, [save, plot, json_file, state])
-    for file in (save, plot, json_file, state):
-        given.check_writable(json_file=file)
+    given.check_writable(save, plot, state, or_stdout=json_file)
     if state is not None:
         if plot is not None or seconds != 20.0:
             raise InputError(
@@ -104,8 +103,6 @@ def experiment(
             f"{plot} has the ending {plot.suffix or '(none)'}, but a figure is written as "
             f"{', '.join(FIGURE_ENDINGS)}; choose one of these."
         )
-    if given.STDOUT in (save, plot, state):
-        raise InputError("A file was given as -, but only --json goes to stdout; name the file.")
     model = by_name.model(given.one_model(joints), add or ())
     model, columns = columns.of(model)
     first, second, *others = (by_name.effect(text) for text in (*between, *(further or ())))
@@ -211,10 +208,7 @@ def _continued(
             "--travel), but the state has these; leave them out."
         )
     given.check_overwritten([state, recording], [save, json_file])
-    for file in (save, json_file):
-        given.check_writable(json_file=file)
-    if save == given.STDOUT:
-        raise InputError("A file was given as -, but only --json goes to stdout; name the file.")
+    given.check_writable(save, or_stdout=json_file)
     e = SequentialExperiment.load(state)
     if e.verdict:
         raise InputError(f"{state} has ended ({e.verdict}); begin another experiment with --state.")

@@ -3,6 +3,8 @@
 import json
 from pathlib import Path
 
+import typer
+
 from rotflex_jax.cli import arguments as given, terminal
 from rotflex_jax.cli.recordings import Columns, reads_files
 from rotflex_jax.errors import InputError
@@ -25,9 +27,7 @@ def simulate(
     """Simulate a recording in free run and compare with what was measured."""
     given.check_distinct([file], fit or [])
     given.check_overwritten([file, *(fit or [])], [save, save_model])
-    for target in (save, save_model):
-        given.check_writable(json_file=target)
-    given.check_writable(folder=report)
+    given.check_writable(save, save_model, folder=report)
     model = by_name.model(given.one_model(joints), add or ())
     model, columns = columns.of(model)
     recording = columns.load(file)
@@ -72,7 +72,17 @@ def simulate(
         terminal.message(f"Report: {page}")
 
 
+# Option of `rotflex export` -> forms of export that use it.
+USED_IN = {
+    "Ts": ("c", "statespace", "controller", *given.SIMULATORS),
+    "prefix": ("c", "controller"),
+    "length": ("bam",),
+    "actuator": ("bam",),
+}
+
+
 def export(
+    context: typer.Context,
     model: given.ExportedModel,
     to: given.ExportForm,
     out: given.ExportFile = None,
@@ -84,8 +94,11 @@ def export(
 ) -> None:
     """Give a model as C code, as equations, as state space or for a simulator, or a controller of it in C."""
     form = by_name.choose(to, given.EXPORT_FORMS, "form of export")
+    for option, forms_with in USED_IN.items():
+        if given.was_given(context, option) and form not in forms_with:
+            raise InputError(f"--{option} was given, but {form} has no use of it; leave it out.")
     given.check_overwritten([Path(model.partition(":")[0])], [out])
-    given.check_writable(json_file=out)
+    given.check_writable(or_stdout=out)
     if form == "fmu" and out in (None, given.STDOUT):
         raise InputError("An FMU is an archive, which is not shown as text; give --out FILE.fmu.")
     from rotflex_jax import export as forms

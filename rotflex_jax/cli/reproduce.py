@@ -49,7 +49,7 @@ def reproduce(
         )
     share = given.check_split(split, held_out or [])
     given.check_overwritten([*map(Path, data or []), *(held_out or [])], [json_file])
-    given.check_writable(json_file=json_file, folder=out)
+    given.check_writable(or_stdout=json_file, folder=out)
     joint = given.one_model(joints)
     mechanism = by_name.joint(joint)
     parts = _recordings(columns, data or [], held_out or [], share)

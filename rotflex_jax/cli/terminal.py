@@ -291,11 +291,16 @@ def message(text: str, *, error: bool = False) -> None:
 def save_simulation(file: Path, recording: Any, simulated: Mapping[str, Real[np.ndarray, " N"]]) -> None:
     """Write time, input and signals, measured and simulated outputs as CSV, in the units of the recording.
 
+    The names of the columns have these units where `rotflex_jax.data.save_csv` has them.
+
     Raises:
         InputError: The file cannot be written; an old one stays.
     """
-    inputs = [recording.input_name, *recording.signals]
-    names = ["t", *inputs, *recording.channels, *(f"{c}_simulated" for c in simulated)]
+    from rotflex_jax.data.files import column_title  # imported here, so that `--help` answers at once
+
+    names = ["t", column_title(recording.input_name, recording.input_unit, "V"), *recording.signals]
+    names += [column_title(c, recording.unit(c), "rad") for c in recording.channels]
+    names += [column_title(f"{c}_simulated", recording.unit(c), "rad") for c in simulated]
     columns = np.column_stack(
         [recording.t, recording.inputs(recording.signals), recording.y, *simulated.values()]
     )

@@ -458,13 +458,13 @@ def save_csv(recording: Recording, path: str | os.PathLike[str]) -> Path:
     # 17 digits represent a number exactly; the time is known to fewer digits.
     formats = ["%.15g"] + ["%.17g"] * (columns.shape[1] - 1)
     outputs = zip(recording.channels, recording.units, strict=True)
-    header = ["t", _titled(recording.input_name, recording.input_unit, "V")]
-    header += [*(_titled(name, unit, "rad") for name, unit in outputs), *recording.signals]
+    header = ["t", column_title(recording.input_name, recording.input_unit, "V")]
+    header += [*(column_title(name, unit, "rad") for name, unit in outputs), *recording.signals]
     csv.writer(text := StringIO(), lineterminator="\n").writerow(header)
     np.savetxt(text, columns, fmt=formats, delimiter=",")
     return write_file(path, text.getvalue())
 
 
-def _titled(name: str, unit: str, assumed: str) -> str:
+def column_title(name: str, unit: str, assumed: str) -> str:
     """The name of a column, with its unit in brackets if that is not the one which `load` assumes."""
     return name if unit in ("", assumed) else f"{name} [{unit}]"
