@@ -380,7 +380,7 @@ def as_options(sentence: str) -> str:
     sentence = re.sub(r"\bresample='?(\w+)'?", r"--resample \1", sentence)
     sentence = re.sub(r"\bcounts=\{'(\w+)': (\d+)\}", r"--counts \1=\2", sentence)
     sentence = re.sub(r"\bSettings\((\w+=[^()]+)\)", r"--set \1", sentence)
-    sentence = re.sub(r"(?<!--set )\b(input|time|Ts|counts)=(?=\d)", r"--\1 ", sentence)
+    sentence = re.sub(r"(?<!--set )\b(input|time|Ts|counts|seconds)=(?=\d)", r"--\1 ", sentence)
     sentence = re.sub(r"\boutputs=\{'(\w+)': 'COLUMN'\}", r"--output \1=COLUMN", sentence)
     sentence = sentence.replace("import the module that registers it first", "name its file, --with FILE.py")
     sentence = re.sub(r"\bsignals=\{'([^']+)': 'COLUMN'\}", r'--signal "\1=COLUMN"', sentence)

@@ -29,7 +29,7 @@ FIRST_COMMAND = (
     "plot",
     "further",
 )
-FIRST_COMMAND += ("error", "max_seconds", "intersample", "substeps")
+FIRST_COMMAND += ("error", "max_seconds", "seconds", "rank_only", "joints", "intersample", "substeps")
 FIGURE_ENDINGS = (".png", ".svg", ".pdf", ".jpg")
 
 
@@ -85,6 +85,10 @@ def experiment(
     assert fit is not None and voltage is not None
     if further and state is None:
         raise InputError("--or was given, but more than two are told apart with --state only; add it.")
+    if state is None and any(given.was_given(context, name) for name in ("error", "max_seconds")):
+        raise InputError(
+            "--error or --max-seconds was given, but an experiment stops by itself with --state only; add it."
+        )
     given.check_distinct(fit, [])
     given.check_overwritten(fit, [save, plot, json_file, state])
     given.check_writable(save, plot, state, or_stdout=json_file)
@@ -275,14 +279,24 @@ def _limits(model: Any, voltage: float, slew: float, travel: float, deflection: 
     from rotflex_jax.mechanism.linear import output_units
     from rotflex_jax.models.model import Model
 
-    units = list((outputs := output_units(Model.of(model).mechanism)).values())
-    if math.isfinite(deflection) and len(units) < 2:
-        raise InputError(
-            f"--deflection {deflection:g} was given, but the model has one output, {', '.join(outputs)}; "
-            "limit it with --travel."
-        )
-    first, second = (as_read(1.0, unit)[0] for unit in (units[0], units[min(1, len(units) - 1)]))
-    return Limits(voltage, slew, travel / first, deflection / second)  # degrees by degrees per radian
+    outputs = list(output_units(Model.of(model).mechanism).items())
+    found = []
+    for option, value, (channel, unit) in zip(
+        ("--travel", "--deflection"), (travel, deflection), [*outputs, ("", "")], strict=False
+    ):
+        of_one, shown = as_read(1.0, unit)  # degrees per radian, millimetres per metre
+        if not value > 0:
+            raise InputError(
+                f"{option} was given {value:g}, but needs a positive number in {shown}; give what the "
+                "machine bears."
+            )
+        if not channel and math.isfinite(value):
+            raise InputError(
+                f"{option} {value:g} was given, but the model has one output, {outputs[0][0]}; limit it with "
+                "--travel."
+            )
+        found.append(value / of_one)
+    return Limits(voltage, slew, *found)
 
 
 def _check_length(seconds: float, Ts: float) -> None:

@@ -47,12 +47,11 @@ def reproduce(
         raise InputError(
             "--signal was given, but the experiment of the paper has its input alone; leave it out."
         )
-    share = given.check_split(split, held_out or [])
     given.check_overwritten([*map(Path, data or []), *(held_out or [])], [json_file])
     given.check_writable(or_stdout=json_file, folder=out)
     joint = given.one_model(joints)
     mechanism = by_name.joint(joint)
-    parts = _recordings(columns, data or [], held_out or [], share)
+    parts = _recordings(columns, data or [], held_out or [], split, joints)
     if parts and joint == "paper" and data == ["rotflex"]:
         mechanism = by_name.joint("quanser_2002")  # the laboratory's own constants
     from rotflex_jax.runtime.xla import enable_fast_start
@@ -91,18 +90,31 @@ def _pairs(texts: list[str]) -> dict[str, str]:
     return pairs
 
 
-def _recordings(columns: Columns, data: list[str], held_out: list[Path], share: float) -> tuple[Any, ...]:
+def _recordings(
+    columns: Columns,
+    data: list[str],
+    held_out: list[Path],
+    split: float | None,
+    joints: list[str] | None,
+) -> tuple[Any, ...]:
     """Recordings to fit and held-out recordings; empty for a simulation."""
+    share = given.check_split(split, held_out)
     if not data:
         if columns.Ts is not None:
             raise InputError(
                 "--Ts was given without --data, but it is the sampling period of a file without a time "
                 f"column; write --set Ts={columns.Ts:g} for that of the experiment."
             )
-        if held_out:
+        for option, value in (("held-out", held_out), ("split", split), ("joint", joints)):
+            if value:
+                raise InputError(
+                    f"--{option} was given without --data, but a simulation makes its own held-out data from "
+                    "a machine of its own; give --data too, or leave it out."
+                )
+        if columns != Columns():
             raise InputError(
-                "--held-out was given without --data, but a simulation makes its own held-out data; "
-                "give --data too, or leave it out."
+                "An option that says how to read a file was given without --data; give --data too, or leave "
+                "it out."
             )
         return ()
     if data == ["rotflex"] and not Path("rotflex").exists():
