@@ -98,6 +98,12 @@ CONTENT: dict[str, tuple[bytes, dict[str, Any], str]] = {
     "time stands": (text(t=late(50, -0.002)), {}, "duplicate time stamp between lines 51 and 52"),
     "jitter": (text(t=late(50, 1e-4)), {}, r"jittery: .* lines 5[12] and 5[23] .*off by 5 %"),
     "milliseconds": (text(t=2.0 * np.arange(N)), {}, "advances by 2 .*looks like milliseconds"),
+    "microseconds": (
+        text(t=2e3 * np.arange(N)),
+        {},
+        "like microseconds; pass time_unit='us', or",
+    ),
+    "nanoseconds": (text(t=2e6 * np.arange(N)), {}, "by 2e.06 .*: convert them to seconds, or time_unit='s'"),
     "seconds of ms": (
         text(edited(0, "t_ms,voltage,theta,alpha")),
         {"time": "t_ms", "time_unit": "s"},

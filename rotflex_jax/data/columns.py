@@ -29,6 +29,9 @@ JOINT_SENSORS = ("theta", "alpha", "speed")
 TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6}
 """Unit of time -> its length in seconds."""
 
+LONG_NAMES = {"ms": "milliseconds", "us": "microseconds"}
+"""Unit of time -> its name in a sentence."""
+
 TIME_WORDS = {
     "sec": "s",
     "second": "s",
@@ -441,8 +444,12 @@ def timing(
             "it."
         )
     if measured >= SLOWEST_SAMPLING and not any_unit and time_unit is None:
+        likely = [unit for unit, size in TIME_UNITS.items() if measured * size < SLOWEST_SAMPLING]
+        cure = "convert them to seconds"
+        if likely:
+            cure = f"it looks like {LONG_NAMES[likely[0]]}; pass time_unit={likely[0]!r}"
         raise InputError(
-            f"{label} advances by {measured:g} per sample, too slow for a joint: it looks like "
-            "milliseconds; pass time_unit='ms', or time_unit='s' if these are seconds."
+            f"{label} advances by {measured:g} per sample, too slow for a joint: {cure}, or time_unit='s' if "
+            "these are seconds."
         )
     return float(t[0]), measured
