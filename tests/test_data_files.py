@@ -267,6 +267,14 @@ def test_accepted_faults_reach_the_recording(tmp_path: Path) -> None:
     assert [finding.kind for finding in recording.findings] == ["constant"]
 
 
+def test_a_recording_that_could_not_be_loaded_again_is_not_saved(tmp_path: Path) -> None:
+    file = tmp_path / "run.csv"
+    recording = Recording(u=U, y=Y, Ts=Ts, channels=("voltage", "alpha"))
+    with pytest.raises(InputError, match="more than one column 'voltage'"):
+        save_csv(recording, file)
+    assert not file.exists()
+
+
 def test_what_is_saved_is_loaded_again_bit_by_bit(tmp_path: Path) -> None:
     recording = Recording(u=U, y=Y, Ts=Ts, start=86400.5)
     again = load(save_csv(recording, tmp_path / "run.csv"))

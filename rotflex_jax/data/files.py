@@ -39,6 +39,7 @@ from rotflex_jax.data.tables import (
     Table,
     TimedSignal,
     check_size,
+    distinct,
     name_and_unit,
     resampled,
     resampled_apart,
@@ -451,7 +452,8 @@ def save_csv(recording: Recording, path: str | os.PathLike[str]) -> Path:
         The path.
 
     Raises:
-        InputError: the file cannot be written; an existing file then stays as it is.
+        InputError: the file cannot be written, or two columns would have one name; an existing file then
+            stays as it is.
     """
     recording = single(recording, "recording")
     columns = np.column_stack([recording.t, recording.u, recording.y, *recording.signals.values()])
@@ -460,7 +462,7 @@ def save_csv(recording: Recording, path: str | os.PathLike[str]) -> Path:
     outputs = zip(recording.channels, recording.units, strict=True)
     header = ["t", column_title(recording.input_name, recording.input_unit, "V")]
     header += [*(column_title(name, unit, "rad") for name, unit in outputs), *recording.signals]
-    csv.writer(text := StringIO(), lineterminator="\n").writerow(header)
+    csv.writer(text := StringIO(), lineterminator="\n").writerow(distinct(header, Path(path).name))
     np.savetxt(text, columns, fmt=formats, delimiter=",")
     return write_file(path, text.getvalue())
 

@@ -239,15 +239,15 @@ class Recording:
         return self.channels.index(channel)
 
     def slice(self, i: int, j: int) -> "Recording":
-        """The samples from `i` up to, but not including, `j`.
+        """The samples from `i` up to, but not including, `j`; at least two, of which a model may see one.
 
         A part that is short, or at rest, is no error: the whole recording has passed the checks.
         """
         ends = [real(end) for end in (i, j)]
-        if not all(0 <= end <= self.N and end == int(end) for end in ends) or i >= j:
+        if not all(0 <= end <= self.N and end == int(end) for end in ends) or j - i < 2:
             raise InputError(
-                f"A part of the recording must lie within its {self.N} samples, "
-                f"but was asked from {shown(i)} to {shown(j)}; choose 0 <= i < j <= {self.N}."
+                f"A part of the recording must lie within its {self.N} samples and have two or more of them, "
+                f"but was asked from {shown(i)} to {shown(j)}; choose 0 <= i and i + 2 <= j <= {self.N}."
             )
         i, j = int(i), int(j)
         part = replace(
@@ -305,9 +305,9 @@ class Recording:
             wanted = number(seconds, "seconds", unit="s", example="10.0") / self.Ts
         else:
             wanted = self.N * (0.7 if share is None else number(share, "share", example="0.7"))
-        if not 1 <= round(min(max(wanted, 0.0), self.N)) < self.N:
+        if not 2 <= round(min(max(wanted, 0.0), self.N)) <= self.N - 2:
             raise InputError(
-                f"Both parts of a split must have samples, but the first would have {wanted:.6g} "
+                f"Both parts of a split must have two samples or more, but the first would have {wanted:.6g} "
                 f"of {self.N}; give a share between 0 and 1, or fewer than {self.duration:g} s."
             )
         return self.slice(0, round(wanted)), self.slice(round(wanted), self.N)
@@ -324,15 +324,16 @@ class Recording:
             k: factor; samples at the end that do not fill a group of k are left out.
         """
         factor = real(k)
-        if not (1 <= factor <= self.N and factor == int(factor)):
+        if not (1 <= factor <= self.N / 2 and factor == int(factor)):
             raise InputError(
-                f"Argument `k` must be a whole number from 1 to the {self.N} samples, but is {shown(k)}; "
-                "give for instance 2."
+                f"Argument `k` must be a whole number from 1 to half of the {self.N} samples, but is "
+                f"{shown(k)}; give for instance 2."
             )
         k = int(factor)
         groups, before = self.N // k, self.continues
-        if before is not None:  # its last group of samples ends where this recording begins
-            before = before.slice(before.N % k, before.N).decimate(k) if k <= before.N else None
+        # Its last group of samples ends where this recording begins; one group is no recording.
+        if before is not None:
+            before = before.slice(before.N % k, before.N).decimate(k) if 2 * k <= before.N else None
         u, *acting = (
             x[: groups * k].reshape(groups, k).mean(axis=1) for x in (self.u, *self.signals.values())
         )
