@@ -309,6 +309,7 @@ def test_a_unit_of_the_file_is_not_called_radians(tmp_path: Path) -> None:
     remark = write_text(tmp_path / "remark.csv", "t,voltage,theta (measured),alpha (strain gauge)")
     assert load(remark).units == ("rad", "rad")
     small = write_text(tmp_path / "small.csv", "t,voltage,theta [mrad],alpha [mrad]")
+    german = write_text(tmp_path / "german.csv", "t,voltage,theta [rad],alpha [Grad]")
     counted = write_text(tmp_path / "counted.csv", "t,voltage,theta [counts],alpha [rad]")
     assert load(small, units={"theta": "mrad", "alpha": "mrad"}).units == ("mrad", "mrad")
     assert load(small, accept=("units",)).units == ("rad", "rad")
@@ -317,6 +318,7 @@ def test_a_unit_of_the_file_is_not_called_radians(tmp_path: Path) -> None:
         (small, {}, r"is in mrad by its name, but an output .* pass units=\{'theta': 'mrad'\}, or convert"),
         (small, {"units": {"theta": "m"}}, "is in mrad by its name, but was given in m; leave out that unit"),
         (small, {"degrees": True}, "is in mrad by its name, but degrees=True was given"),
+        (german, {}, "'alpha .Grad.' is in Grad by its name, but an output is taken in rad unless"),
         (counted, {}, "is in counts by its name, but an output .* pass counts=4096 or what one turn has,"),
     ):
         with pytest.raises(InputError, match=phrase):

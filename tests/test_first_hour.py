@@ -242,6 +242,7 @@ def test_a_long_gap_is_not_bridged() -> None:
     [
         (("Time [s]", "Voltage [V]", "Theta [rad]", "Alpha [rad]"), (1.0, 1.0)),
         (("Time [ms]", "Voltage (V)", "Theta [deg]", "Alpha [°]"), (1e3, 180 / np.pi)),
+        (("t", "voltage", "theta (degrés)", "alpha [º]"), (1.0, 180 / np.pi)),
         (("T", "VOLTAGE", "THETA", "ALPHA"), (1.0, 1.0)),
     ],
 )

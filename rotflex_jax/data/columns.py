@@ -52,7 +52,8 @@ INPUT_UNITS = {"V": {"v", "volt", "volts", "voltage"}, "A": {"a", "amp", "ampere
 
 COUNT_UNITS = frozenset({"count", "counts", "cnt", "cnts", "tick", "ticks"})
 OTHER_UNITS = COUNT_UNITS | {
-    *("mrad", "urad", "µrad", "μrad", "rev", "revs", "turn", "turns", "gon", "rpm"),
+    *("mrad", "urad", "µrad", "μrad", "rev", "revs", "turn", "turns", "gon", "grad", "rpm"),
+    *("mdeg", "arcmin", "arcsec"),
     *("m", "cm", "mm", "um", "µm", "μm", "inch", "m/s", "mm/s", "v", "mv", "ma"),
 }
 """Lower-case units of outputs other than radians and degrees; other words in brackets are remarks."""
@@ -152,7 +153,11 @@ def column_of(table: Table, name: str, argument: str, wrong: Mapping[str, str]) 
 
 def _words(table: Table, name: str) -> set[str]:
     """The words of a name and of its unit, in lower case."""
-    return set(re.split(r"[^a-z°]+", f"{name} {table.units.get(name, '')}".lower()))
+    return _split(f"{name} {table.units.get(name, '')}")
+
+
+def _split(text: str) -> set[str]:
+    return set(re.split(r"[^\w°]+|[\d_]+", text.lower()))
 
 
 def _as_written(table: Table, name: str, word: str) -> str:
@@ -326,7 +331,7 @@ def _check_other_unit(table: Table, channel: str, name: str, given: str | None, 
 
 def _angle_unit(table: Table, name: str) -> tuple[str | None, str]:
     """Unit of an angle, "deg" or "rad", by the unit in the file or else by the name; and where it is said."""
-    for words in (set(re.split(r"[^a-z°]+", _unit(table, name).lower())), _words(table, name)):
+    for words in (_split(_unit(table, name)), _words(table, name)):
         said = [unit for unit, spellings in ANGLE_UNITS.items() if words & spellings]
         if len(said) == 1:
             return said[0], _unit_source(name, min(words & ANGLE_UNITS[said[0]]))

@@ -318,8 +318,8 @@ def name_and_unit(name: str) -> tuple[str, str]:
     return (found[1], found[2]) if found else (name.strip(), "")
 
 
-DEGREES = ("deg", "degs", "degree", "degrees", "°")
-"""Spellings of degrees."""
+DEGREES = ("deg", "degs", "degree", "degrees", "degré", "degrés", "grados", "gradi", "°", "º")
+"""Spellings of degrees in lower case; `grad` is none, which is German for a degree and English for a gon."""
 
 
 def in_radians(unit: str) -> str | None:
