@@ -267,6 +267,30 @@ def test_accepted_faults_reach_the_recording(tmp_path: Path) -> None:
     assert [finding.kind for finding in recording.findings] == ["constant"]
 
 
+def test_an_array_of_records_gives_a_column_for_each_field(tmp_path: Path) -> None:
+    records = np.rec.fromarrays(list(COLUMNS.values()), names=list(COLUMNS))
+    np.savez(tmp_path / "run.npz", log=records)
+    options = {"time": "log.t", "input": "log.voltage", "outputs": ("log.theta", "log.alpha")}
+    assert_is_the_run(load(tmp_path / "run.npz", **options))
+
+
+@pytest.mark.parametrize("options", [{}, {"Ts": Ts}])
+def test_an_empty_row_of_a_spreadsheet_is_not_passed_over(options, tmp_path: Path) -> None:
+    openpyxl = pytest.importorskip("openpyxl")
+    book = openpyxl.Workbook()
+    for row in (list(COLUMNS), [], *np.column_stack(list(COLUMNS.values())).tolist()):
+        book.active.append(row)
+    book.save(tmp_path / "run.xlsx")
+    assert_is_the_run(load(tmp_path / "run.xlsx"))  # an empty row below the names is none of the samples
+    for cell in book.active[50]:
+        cell.value = None
+    if options:
+        book.active.delete_cols(1)
+    book.save(tmp_path / "run.xlsx")
+    with pytest.raises(InputError, match="has the empty row 50 among its samples"):
+        load(tmp_path / "run.xlsx", **options)
+
+
 def test_a_recording_that_could_not_be_loaded_again_is_not_saved(tmp_path: Path) -> None:
     file = tmp_path / "run.csv"
     recording = Recording(u=U, y=Y, Ts=Ts, channels=("voltage", "alpha"))

@@ -6,6 +6,7 @@ Source:
     Apache Parquet, File format and parquet.thrift; Apache Thrift, Compact protocol.
 """
 
+import itertools
 import math
 import os
 import zipfile
@@ -27,7 +28,8 @@ def table_from_xlsx(path: Path, max_bytes: int = MAX_BYTES) -> Table:
     """The columns of the first sheet that has any: names in its first row, possibly units in the second.
 
     Raises:
-        InputError: openpyxl is missing, the file is damaged or too large, or no sheet has names and numbers.
+        InputError: openpyxl is missing, the file is damaged or too large, no sheet has names and numbers, or
+            a row among the numbers is empty.
     """
     openpyxl: Any = optional("openpyxl", f"Reading {path.name}")
     try:
@@ -66,6 +68,12 @@ def _table(label: str, rows: list[tuple[int, tuple[Any, ...]]]) -> Table:
     units: dict[str, str] = {}
     if len(cells) > 1 and all(isinstance(c, str) for c in cells[0]) and "".join(cells[0]).strip():
         units, cells, rows = dict(zip(names, cells[0], strict=True)), cells[1:], rows[1:]
+    empty = next((k + 1 for (k, _), (after, _) in itertools.pairwise(rows) if after > k + 1), None)
+    if empty is not None:
+        raise InputError(
+            f"{label} has the empty row {empty} among its samples, where some may be missing; cut the "
+            "recording there, or remove the row if none is."
+        )
     columns = {name: _column([row[k] for row in cells]) for k, name in enumerate(names)}
     return Table(label, columns, "row", rows[0][0], units)
 
@@ -333,6 +341,9 @@ def _flat(values: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Shaped
         try:
             array = np.asarray(value)
         except ValueError:  # cells of different length
+            continue
+        if array.dtype.names:  # records with named fields
+            found += _flat({key: array[key] for key in array.dtype.names}, f"{name}.")
             continue
         if name.startswith("__") or array.dtype.kind == "V":  # header of the file, or not decoded
             continue
