@@ -267,6 +267,14 @@ def test_accepted_faults_reach_the_recording(tmp_path: Path) -> None:
     assert [finding.kind for finding in recording.findings] == ["constant"]
 
 
+def test_no_files_and_no_size_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="list of files was given, but it is empty"):
+        load([])
+    for size in ("2 GB", -1):
+        with pytest.raises(InputError, match="`max_bytes` must be a finite number above 0"):
+            load(write_text(tmp_path / "run.csv"), max_bytes=size)
+
+
 def test_an_array_of_records_gives_a_column_for_each_field(tmp_path: Path) -> None:
     records = np.rec.fromarrays(list(COLUMNS.values()), names=list(COLUMNS))
     np.savez(tmp_path / "run.npz", log=records)

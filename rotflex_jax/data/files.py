@@ -90,6 +90,8 @@ def read_table(source: Any, max_bytes: int = MAX_BYTES, time: str | None = None)
     if hasattr(source, "columns") and hasattr(source, "to_numpy"):
         return table_from_frame(source)
     if isinstance(source, list | tuple):
+        if not source:
+            raise InputError("A list of files was given, but it is empty; name a file for each channel.")
         return _together(source, f"{len(source)} files", max_bytes, time)
     if isinstance(source, str | os.PathLike) and os.path.isdir(source):
         folder = Path(source)
@@ -296,6 +298,7 @@ def load(
         units,
         resample,
     )
+    positive(max_bytes, "max_bytes", "bytes", "2e9")
     if resample is not None and Ts is not None:
         raise InputError(
             f"Argument `resample` and Ts={shown(Ts)} were both given, but resampling "
