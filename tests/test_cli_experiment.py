@@ -43,7 +43,7 @@ def called(*arguments: object) -> int:
             ["--between", "delay@input", "lag@input", "--voltage", "5", "--travel", "-3"],
             "given -3, but needs",
         ),
-        (["--between", "delay@input", "lag@input", "--voltage", "5", "--deflection", "0"], "of degrees"),
+        (["--between", "delay@input", "lag@input", "--voltage", "5", "--deflection", "0"], "in deg;"),
         (["--between", "delay@input", "lag@input", "--voltage", "5", "--error", "0.1"], "--state only"),
         (["--between", "delay@input", "lag@input", "--voltage", "5", "--max-seconds", "9"], "--state only"),
         (["--between", "delay@input", "lag@input", "--voltage", "5", "--save", "/none/x.csv"], "does not"),

@@ -511,7 +511,7 @@ def test_times_in_other_units_and_folders_without_recordings_are_refused(tmp_pat
     refused(files, "the times are in '' and 'ms'")
     (tmp_path / "empty").mkdir()
     refused(tmp_path / "empty", "is a folder, but a recording is one file")
-    refused([], "0 files")
+    refused([], "list of files was given, but it is empty")
 
 
 # -- Damage ----------------------------------------------------------------------------------------------
