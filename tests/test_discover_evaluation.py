@@ -100,6 +100,9 @@ def test_candidates_whose_score_the_winner_took_are_refitted_too():
     # A score of a quarter of the best is enough; one of which a tenth is left is not lost.
     quarter = ({"gravity": 100.0, "coulomb": 25.0, "viscous": 24.9}, {})
     assert replaced(quarter, ({"gravity": 95.0}, {})) == ["coulomb"]
+    # Shares of both horizons are added: two of 13 % are more than a quarter.
+    both = ({"gravity": 100.0, "coulomb": 13.0}, {"cogging": 100.0, "coulomb": 13.0})
+    assert replaced(both, ({"gravity": 95.0}, {"cogging": 95.0})) == ["coulomb"]
     assert replaced(({"gravity": 40.0}, {}), ({"gravity": 4.0}, {})) == []
     # At most two are taken, those with the largest shares over both horizons,
     gone = ({}, {})

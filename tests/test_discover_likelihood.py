@@ -229,6 +229,15 @@ def test_more_freedom_is_never_less_likely(rough):
     assert refit(rough, [large])[0].log_likelihood > small.log_likelihood + 50
 
 
+def test_blocks_of_free_runs_count_errors_by_their_factor_down_to_the_noise(plain):
+    """An error a tenth as large gains log 10; below the sensor noise there is nothing left to gain."""
+    problem, h = plain
+    runs, shape = problem.of_free_runs(problem.windows), problem.dataset.data.y.shape
+    block = lambda times: runs.evaluated(h, np.full(shape, times * sp.NOISE)).blocks  # noqa: E731
+    np.testing.assert_allclose(block(1e2) - block(1e3), np.log(10), rtol=1e-4)
+    assert np.all(np.abs(block(0.01) - block(0.1)) < 0.01)
+
+
 def test_process_noise_is_nil_where_the_model_is_right_and_not_where_it_is_wrong(plain, rough):
     problem, right = plain
     least, most = problem.process_noise_range

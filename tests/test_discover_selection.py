@@ -228,6 +228,13 @@ def test_of_what_cannot_be_told_apart_dry_friction_goes_first():
         windows = 5.0 * np.exp(share * selection.WINDOWS_APART)
         slower = trial(ARM, **close | {"windows": windows}, seed=2)
         assert (choose([drag, slower], BASE, MEASURED, NOISE)[0] is slower) is first
+    # Parameters fitted to free runs, whose runs are as good as those with the drag, do not help.
+    near, runs = {"windows": 1.5}, STRONG | {"windows": 1.5}
+    drag = at_both(GOOD | {"held_out": 210.0, "train": 210.0} | near, runs, DRAG)
+    for share, first in ((0.99, True), (1.01, False)):
+        windows = 1.5 * np.exp(share * selection.WINDOWS_APART)
+        slower = at_both(close | {"windows": windows}, runs, ARM)
+        assert (choose([drag, slower], FAR, MEASURED, NOISE)[0] is slower) is first
 
 
 def dead_zone_before_friction(
@@ -986,6 +993,19 @@ def test_a_poor_model_leaves_twice_the_noise(side: float) -> None:
     assert selection.is_poor(trial(None, windows=2.0 * side), NOISE) is (side > 1)
     assert not selection.is_poor(trial(None, windows=2.0), NOISE)
     assert selection.is_poor(at_both({"windows": 9.0}, {"windows": 2.0 * side}), NOISE) is (side > 1)
+    one_channel = dataclasses.replace(trial(None), window_rmse=np.array([1.0, 2.0 * side]) * NOISE)
+    assert selection.is_poor(one_channel, NOISE) is (side > 1)
+
+
+@pytest.mark.parametrize("folds", [True, False], ids=["validating each other", "held out"])
+def test_samples_that_validate_each_other_count_once(folds: bool) -> None:
+    """Counted twice, the same differences would have sqrt(2) times as many standard deviations."""
+    lead = 1.6 * np.sqrt(BLOCKS) * np.sqrt(BLOCKS / (BLOCKS - 1))  # z is 1.6, or 2.26 if counted twice
+    winner = trial(COULOMB, held_out=lead, train=lead, scatter=1.0)
+    winner = dataclasses.replace(winner, folds=(winner.hypothesis,) if folds else ())
+    rival = dataclasses.replace(trial(DRAG), folds=winner.folds)
+    assert paired_gain(winner.blocks, rival.blocks)[1] == pytest.approx(1.6)
+    assert distinguished(winner, rival) is not folds
 
 
 @pytest.mark.parametrize(

@@ -288,7 +288,8 @@ class LikelihoodProblem:
     def _error_blocks(self, e: np.ndarray) -> np.ndarray:
         """Minus the logarithm of the root mean square error of each block, mean over channels.
 
-        Errors of free runs are correlated from sample to sample, and large where the model drifts. With
+        The variance of the sensor noise is added, so that an error below it gains nothing more. Errors of
+        free runs are correlated from sample to sample, and large where the model drifts. With
         log-likelihoods, a few blocks would decide. Here the factor by which the error decreases counts, and
         all blocks have the same weight.
         """
