@@ -186,6 +186,13 @@ def test_a_hundredth_at_an_end_is_no_piece_of_its_own(start: int, stop: int, sai
     assert found.expected == pytest.approx((held.stop - held.start) / 1000)
 
 
+@pytest.mark.parametrize(("early", "late", "said"), [(300, 900, "before 3.0 s"), (100, 700, "after 7.0 s")])
+def test_of_large_errors_at_both_ends_the_longer_piece_is_told(early: int, late: int, said: str) -> None:
+    e = 0.1 * np.where(np.arange(1000) % 2, 1.0, -1.0)
+    e[:early], e[late:] = 10 * e[:early], 10 * e[late:]
+    assert said in localise.in_time("theta", e, record(1000)).where.statement
+
+
 def test_the_significance_in_time_is_that_of_kuiper() -> None:
     """The p-value is 2 sum (4 j^2 v^2 - 1) exp(-2 j^2 v^2), computed here.
 

@@ -346,7 +346,7 @@ def in_time(channel: str, error: Float[np.ndarray, " N"], recording: Recording) 
     tail = 2 * np.sum((4 * j**2 * v**2 - 1) * np.exp(-2 * j**2 * v**2))
     p_value = float(np.clip(tail, 0.0, 1.0)) if v > 0.4 else 1.0
     # The error is large where the cumulative sum rises. If that wraps around the ends, there are two
-    # stretches, of which one is reported.
+    # stretches, of which the one with the larger excess is reported.
     low, high = int(walk.argmin()), int(walk.argmax())
     if low > high:
         low, high = max(((0, high), (low, N)), key=lambda part: walk[part[1]] - walk[part[0]])
