@@ -202,3 +202,11 @@ def test_a_linear_model_and_a_file_have_the_late_sensor(tmp_path):
     model.save(tmp_path / "model.json")
     again = Model.load(tmp_path / "model.json")
     np.testing.assert_array_equal(simulate(again.mechanism, u, Ts), expected)
+
+
+def test_the_largest_reading_is_the_top_of_the_characteristic():
+    """Reference: the maximum of the characteristic on a fine grid, up to where its slope changes sign."""
+    v = np.linspace(0.0, 1.0, 100_001)
+    bent = fx.SensorCubic("alpha", cubic=-2.0)
+    assert bent.largest_reading() == pytest.approx(float(np.max(bent.measure(v))), rel=1e-8)
+    assert fx.SensorCubic("alpha", cubic=2.0).largest_reading() == math.inf

@@ -51,6 +51,16 @@ def test_intervals_hold_the_amplitude_as_often_as_they_say() -> None:
     assert np.mean(held) >= 0.85  # 0.95 expected, and 0.85 is beyond three standard deviations
 
 
+def test_the_interval_in_white_noise_is_that_of_a_regression() -> None:
+    """An amplitude in white noise of standard deviation one has the standard deviation sqrt(2 / N)."""
+    sine, widths = 0.5 * np.sin(2 * np.pi * 7.3 * T), []
+    for seed in range(8):
+        x = sine + np.random.default_rng(seed).standard_normal(N)
+        low, high = periodic_torques(x, excitation.noise(N, Ts, seed=seed), Ts)[0].interval
+        widths.append(high - low)
+    assert np.mean(widths) == pytest.approx(2 * 1.96 * np.sqrt(2 / N), rel=0.1)
+
+
 def test_two_sines_are_two() -> None:
     x = coloured(np.random.default_rng(1)) + np.sin(2 * np.pi * 5 * T) + 2 * np.cos(2 * np.pi * 23 * T)
     lines = periodic_torques(x, excitation.noise(N, Ts, seed=1), Ts)
@@ -66,6 +76,13 @@ def test_torques_of_the_motion_are_no_disturbance(kind: str) -> None:
         x = dry_friction(u) + 0.1 * coloured(np.random.default_rng(seed))
         found += len(periodic_torques(x, u, Ts))
     assert found <= 1
+
+
+def test_three_periods_are_enough_for_an_input_to_repeat_itself() -> None:
+    """A sine as input has one line, while friction under it has lines at its odd multiples too."""
+    u = np.sin(2 * np.pi * 3 * np.arange(N) / N)
+    x = -np.sign(np.cos(2 * np.pi * 3 * np.arange(N) / N)) + 0.1 * coloured(np.random.default_rng(2))
+    assert periodic_torques(x, u, Ts) == ()
 
 
 def test_an_input_that_repeats_itself_makes_lines_of_its_own() -> None:
