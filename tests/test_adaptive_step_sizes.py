@@ -237,6 +237,16 @@ def test_settling_agrees_with_stepping_the_mean() -> None:
     np.testing.assert_array_equal(found, outside)
 
 
+def test_a_weight_whose_best_value_is_out_of_reach_never_settles() -> None:
+    """Of two equal regressors, LMS from zero finds half of the sum of the weights for each."""
+    x = np.random.default_rng(7).standard_normal(500)
+    moments, mu = Moments.of_regressors(np.column_stack([x, x])), 0.01
+    assert settling_samples(moments, mu, np.array([1.0, 0.8]), 0) == np.inf  # ends 10 % below
+    # With equal weights the error falls by 1 - 2 mu mean x^2 with each sample.
+    steps = np.log(0.05) / np.log(1 - 2 * mu * np.mean(x**2))
+    assert settling_samples(moments, mu, np.ones(2), 0) == np.ceil(steps)
+
+
 def test_settling_factor_puts_a_weight_where_it_was_asked_for() -> None:
     moments = Moments.gaussian(ar1_covariance(0.5, 5))
     w = np.random.default_rng(6).standard_normal(21)

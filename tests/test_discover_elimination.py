@@ -2,6 +2,7 @@
 
 import dataclasses
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -103,6 +104,23 @@ def test_of_two_levels_at_one_port_one_is_needless(s, monkeypatch: pytest.Monkey
             p for p in locations if p != COULOMB or ARM in locations
         }
         np.testing.assert_allclose(simulated(s, h), true, atol=1e-9)
+
+
+@pytest.mark.parametrize(("blocks", "needed"), [(1, False), (3, False), (5, True), (40, True)])
+def test_a_gain_from_a_few_moments_needs_no_effect(
+    monkeypatch: pytest.MonkeyPatch, blocks: int, needed: bool
+) -> None:
+    """A gain of 100 nats in k of 40 equal blocks has z = sqrt(39 k / (40 - k)), above two from k = 4 on."""
+    gain = np.where(np.arange(40) < blocks, 100.0 / blocks, 0.0)
+    held: Any = SimpleNamespace(locations=(COULOMB, ARM), log_likelihood=100.0, blocks=gain)
+    less = SimpleNamespace(locations=(ARM,), log_likelihood=0.0, blocks=np.zeros(40))
+    problem = SimpleNamespace(supermodel=SimpleNamespace(calibrations=()), measured_values=1e4)
+    at = SimpleNamespace(problem=problem)
+    horizons: Any = SimpleNamespace(prediction=at, free_run=at, validated=lambda *_: None)
+    monkeypatch.setattr(stepwise, "refit_without", lambda problem, h, tested, **_: [less] * len(tested))
+    monkeypatch.setattr(stepwise, "parameter_count", lambda *_: 1)
+    monkeypatch.setattr(stepwise, "_need", lambda *_: False)
+    assert (stepwise.eliminate(horizons, held, held, [COULOMB, ARM]).prediction is held) is needed
 
 
 @pytest.mark.parametrize("more", [COULOMB, STRIBECK])

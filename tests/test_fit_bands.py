@@ -16,8 +16,9 @@ from rotflex_jax.discover.probabilities import Probabilities, SetProbability
 from rotflex_jax.discover.verdict import Verdict
 from rotflex_jax.effects import Inertia, Motor
 from rotflex_jax.fit import Fit
-from rotflex_jax.fit.bands import _fast_bristles
+from rotflex_jax.fit.bands import _fast_bristles, scatter
 from rotflex_jax.fit.result import FitOptions
+from rotflex_jax.parameters import Estimate, Specification
 
 N, TS, NOISE = 300, 0.01, 0.02
 CONSTANT = "hub.motor.torque_constant"
@@ -95,6 +96,20 @@ def test_what_each_recording_has_for_itself_widens_the_band():
     own = bands.parts["own of each recording"][:, 0]
     same = rf.prediction_bands(with_std(fit, 1.0), recording(4, 1e-3)).parts["parameters"][:, 0]
     np.testing.assert_allclose(own, same * spread / fit[CONSTANT].value, rtol=1e-6)
+
+
+def test_another_run_scatters_about_the_value_that_is_used():
+    """The variance of the runs, and the square of the distance of their mean from the value."""
+    of_runs = [Estimate.of(CONSTANT, value, 0.1, Specification("N m/A", 0.01)) for value in (1.0, 2.0, 3.0)]
+    assert scatter(of_runs, 2.0) == pytest.approx(1.0) and scatter(of_runs, 4.0) == pytest.approx(1.0 + 4.0)
+    assert scatter(of_runs[:1], 3.0) == pytest.approx(4.0)  # one run does not scatter
+
+
+def test_a_constant_of_the_recording_is_no_source_of_uncertainty():
+    fit, rec = with_std(fitted(), 0.1), recording(2)
+    known = dataclasses.replace(rec, constants={CONSTANT: 0.01})
+    assert "parameters" in rf.prediction_bands(fit, rec).parts
+    assert "parameters" not in rf.prediction_bands(fit, known).parts
 
 
 def test_process_torques_integrate_twice():
