@@ -14,7 +14,7 @@ from rotflex_jax.arena.simulator.records import make_record
 from rotflex_jax.cli import app
 from rotflex_jax.compare import ARX, METHODS, QUICK, Comparison, Fitted, Method, physics, register
 from rotflex_jax.compare.arx import DifferenceEquation, fit_difference_equation
-from rotflex_jax.compare.method import hide_outputs, windowed_runs
+from rotflex_jax.compare.method import divergence_reason, hide_outputs, windowed_runs
 from rotflex_jax.discover import Discovery
 from rotflex_jax.mechanism import simulate
 from rotflex_jax.models.model import Model
@@ -188,6 +188,15 @@ def test_a_method_cannot_cheat() -> None:
     m = seen.n_init
     np.testing.assert_array_equal(seen.y[:m], table.test[0].y[:m])
     assert np.ptp(seen.y[m:], axis=0).tolist() == [0, 0]
+
+
+@pytest.mark.parametrize(("ranges", "diverges"), [(99.0, False), (101.0, True)])
+def test_a_run_diverges_a_hundred_ranges_from_its_start(ranges: float, diverges: bool) -> None:
+    whole = recorded()
+    run = np.tile(whole.y[: whole.n_init].mean(axis=0), (whole.N, 1)).astype(float)
+    run[250:, 1] -= ranges * 0.3
+    reason = divergence_reason([run], [whole], np.array([0.5, 0.3]))
+    assert ("100 times" in reason and f"after {250 * whole.Ts:.3g} s" in reason) is diverges
 
 
 def test_what_goes_wrong_is_a_row() -> None:

@@ -123,6 +123,42 @@ def test_a_gain_from_a_few_moments_needs_no_effect(
     assert (stepwise.eliminate(horizons, held, held, [COULOMB, ARM]).prediction is held) is needed
 
 
+@pytest.mark.parametrize(("count", "loss"), [(1, 2.0), (3, 12.0)])
+@pytest.mark.parametrize("side", [0.99, 1.01], ids=["below", "above"])
+def test_one_effect_replaces_an_effect_with_an_offset_in_each_recording(
+    monkeypatch: pytest.MonkeyPatch, count: int, loss: float, side: float
+) -> None:
+    """It may lose 2 nats and half a log N for each parameter that it saves: count - 1 of exp(10) values.
+
+    Symmetric friction and an offset have 1 + count parameters, asymmetric friction has 2.
+    """
+    rich, offset = EffectLocation("coulomb_asymmetric", "hub"), EffectLocation("voltage_offset", "input")
+    candidate = SimpleNamespace(amplitudes=np.array([True, True]), probes=[[np.array([0.02, 0.02])]])
+    indices = {COULOMB: [0], rich: [1, 2], offset: [3]}
+    s = SimpleNamespace(calibrations=(offset,), candidates={rich: candidate}, parameter_indices=indices.get)
+    h = SimpleNamespace(
+        mean_values=lambda s: np.full(4, 0.02), x0=np.zeros((count, 1, 4)), log_likelihood=0.0
+    )
+    found = SimpleNamespace(log_likelihood=-side * loss)
+    validated = SimpleNamespace(hypothesis=h, with_trained_calibrations=lambda s: h)
+    problem: Any = SimpleNamespace(supermodel=s, measured_values=np.exp(10.0))
+    validation: Any = SimpleNamespace(short_run_errors=lambda h, locations: np.ones(2))
+    for name, stub in {
+        "without": lambda s, h, location: h,
+        "with_effect": lambda *_: h,
+        "refit": lambda *_, **__: [found],
+        "parameter_count": lambda *_: 1,
+        "is_physical": lambda *_: True,
+        "validate": lambda *_: validated,
+    }.items():
+        monkeypatch.setattr(stepwise, name, stub)
+    final: Any = validated
+    merged = stepwise.merge_effects(problem, validation, final, [COULOMB, offset])
+    assert (merged is not None) is (side < 1)
+    if merged:
+        assert (merged.effect, merged.replaced, merged.same_count) == (rich, (COULOMB, offset), count == 1)
+
+
 @pytest.mark.parametrize("more", [COULOMB, STRIBECK])
 def test_the_law_that_is_left_has_gained_what_was_found_first(s, monkeypatch: pytest.MonkeyPatch, more):
     """Stribeck friction gets the rivals of the Coulomb friction that it replaces.

@@ -98,6 +98,12 @@ def test_mujoco_does_what_the_toolkit_does(name):
     assert np.all(np.array(certificate.spans) > 20 * np.array(limits))
 
 
+def test_mujoco_begins_with_a_lag_in_its_steady_state():
+    """An input that begins away from zero finds the lag where its first value has brought it."""
+    certificate = certified(SAID["lag"], 1.0 + U[:500]).certificate
+    assert np.all(np.array(certificate.largest) < NOISE), str(certificate)
+
+
 def test_mujoco_has_the_servo_with_its_limit_and_its_weight():
     firmware = PositionServo(limit=0.3, derivative=0.03)
     servo = position_servo(0.0069, servo=firmware, weight=0.48) + Coulomb("hub", level=0.03)

@@ -313,6 +313,13 @@ def test_a_single_stay_has_a_wide_band():
     assert width[2] > 3 * width[0]
 
 
+def test_the_band_of_a_mean_has_the_uncertainty_of_the_torque_itself():
+    """Where all stays agree, k stays of standard deviation s leave s / sqrt(k)."""
+    x, std = np.tile(np.repeat([0.0, 1.0], 20), 25), 0.2
+    found = binned_mean(x, 3 * x, std + 0 * x, 2, np.zeros(len(x), int))
+    np.testing.assert_allclose(found["high"] - found["mean"], 1.96 * std / np.sqrt(25), rtol=1e-3)
+
+
 def test_offsets_of_a_recording_are_part_of_the_stage():
     nan = float("nan")
     estimate = Estimate("alpha.sensor_bias.bias", 0.01, 1e-3, (0.008, 0.012), "rad")
