@@ -3,6 +3,8 @@
 import dataclasses
 import json
 import re
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -255,6 +257,19 @@ def test_the_slope_of_an_inputs_worth_is_that_of_differences():
         way = rng.standard_normal((1, 60)) + g / np.abs(g).max()
         up, down = (choice._value_and_slope(x + s * 1e-4 * way, 1.0)[0][0] for s in (1, -1))
         assert float(np.sum(g * way)) == pytest.approx((up - down) / 2e-4, rel=0.1)
+
+
+@pytest.mark.parametrize(("side", "stops"), [(0.99, True), (1.01, False)])
+def test_it_goes_on_while_lucky_noise_may_decide(side: float, stops: bool):
+    """A log-likelihood ratio of mean T has the variance 2 T: T + 2 sqrt(2 T) must reach log 99."""
+    T = ((np.sqrt(8 + 4 * np.log(99)) - np.sqrt(8)) / 2) ** 2
+    evidence = side * T * np.array([[[[0.0, 1.0]], [[1.0, 0.0]]]])  # of one input and one draw
+    settings = SimpleNamespace(error=0.01, segment_seconds=2.0)
+    state = SimpleNamespace(settings=settings, seconds=4.0)
+    rivals = SimpleNamespace(count=2, labels=("a", "b"))
+    choice: Any = SimpleNamespace(p=np.array([0.5, 0.5]), e=state, r=rivals)
+    reason = SegmentChoice._too_small(choice, evidence, 3.0, 20, ("noise", "5 Hz"))
+    assert bool(reason) is stops and ("4.6 are needed" in reason) is stops
 
 
 def test_a_pair_that_no_input_can_tell_is_said_to_be_one():
