@@ -12,7 +12,15 @@ from scipy.signal import freqs
 
 import rotflex_jax as rf
 from rotflex_jax.data.datasets import Benchmark, Published, benchmark
-from rotflex_jax.effects import CATALOG, Coulomb, CubicSpring, ViscousAsymmetric, VoltageDrift, VoltageOffset
+from rotflex_jax.effects import (
+    CATALOG,
+    Coulomb,
+    CubicSpring,
+    PeriodicDisturbance,
+    ViscousAsymmetric,
+    VoltageDrift,
+    VoltageOffset,
+)
 from rotflex_jax.errors import InputError
 from rotflex_jax.fit.dataset import sensor_noise
 from rotflex_jax.mechanism.intersample import substep_voltages
@@ -75,6 +83,15 @@ def test_the_axis_runs_up_to_the_speed_of_its_direction(way: float):
 def test_a_drift_adds_its_mean_over_each_sample():
     v = VoltageDrift(rate=0.5).drive(jnp.asarray([1.0, 2.0, 3.0]), 0.1)
     np.testing.assert_allclose(v, [1.025, 2.075, 3.125], rtol=1e-6)
+
+
+def test_a_disturbance_adds_its_mean_over_each_sample():
+    """Reference: the integral of the sine and of the cosine over each sample, at two samples per period."""
+    Ts, f = 0.1, 5.0
+    w, t = 2 * np.pi * f, Ts * np.arange(7)
+    mean = (0.3 * -np.diff(np.cos(w * t)) + 0.4 * np.diff(np.sin(w * t))) / (w * Ts)
+    v = PeriodicDisturbance(sine=0.3, cosine=0.4, frequency=f).drive(jnp.zeros(6), Ts)
+    np.testing.assert_allclose(v, mean, atol=1e-6)
 
 
 @pytest.mark.parametrize("substeps", [1, 2, 4])
