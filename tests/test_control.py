@@ -164,6 +164,18 @@ def test_a_tracked_motion_is_the_best_one():
     np.testing.assert_allclose(X @ c, free + G @ best, atol=1e-6)
 
 
+def test_the_last_value_of_a_reference_is_held_after_its_end():
+    """A reference that ends in a motion is tracked as if its last value went on for a long time."""
+    tracking = Tracking(
+        np.array([[1.0, 0.1], [-0.2, 0.9]]), np.array([0.005, 0.1]), np.array([1.0, 0.0]), 1e-2
+    )
+    r, later = np.linspace(0.0, 1.0, 40), 400
+    short = tracking.solve(r, np.zeros((40, 2)))
+    long = tracking.solve(np.append(r, np.ones(later)), np.zeros((40 + later, 2)))
+    for one, whole in zip(short, long, strict=True):
+        np.testing.assert_allclose(one, whole[:40], atol=1e-9)
+
+
 def test_the_plan_with_friction_moves_the_model_that_has_it():
     """Without feedback, errors of the friction torque accumulate, so the plan must be right at each reversal.
 
