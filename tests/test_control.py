@@ -19,8 +19,10 @@ from rotflex_jax.control import close_loop, controller_to_c, credible_models
 from rotflex_jax.control.closed_loop import run_loop
 from rotflex_jax.control.design import AT_REST, Tracking, torques_along
 from rotflex_jax.errors import InputError
+from rotflex_jax.fit import Fit
 from rotflex_jax.joints import xl330_pendulum
 from rotflex_jax.mechanism.linear import zero_order_hold
+from rotflex_jax.parameters import Estimate
 
 TS = 0.002
 JOINT = rf.joints.paper(hub_damping=0.004, joint_damping=0.003)
@@ -395,9 +397,6 @@ def test_a_machine_that_was_identified_is_held_and_the_found_friction_is_compens
 
 
 def test_models_are_drawn_from_the_distribution_of_the_fit():
-    from rotflex_jax.fit import Fit
-    from rotflex_jax.parameters import Estimate
-
     names = ("hub.coulomb.level", "joint.spring.stiffness")
     covariance = np.array([[4e-4, 1e-4], [1e-4, 1e-2]])
     estimates = tuple(
@@ -411,6 +410,22 @@ def test_models_are_drawn_from_the_distribution_of_the_fit():
     values = np.array([m.mechanism.values[index] for m in list(drawn.values())[1:]])
     np.testing.assert_allclose(np.cov(values.T), covariance, rtol=0.3, atol=1e-4)
     assert np.all(values[:, 0] >= 0)
+
+
+def test_a_draw_outside_of_a_bound_is_repeated():
+    """Reference: the normal distribution cut at zero; far below zero no model is left."""
+    name = "hub.coulomb.level"
+
+    def fit_of(level: float) -> Fit:
+        estimate = Estimate(name=name, value=level, unit="", std=0.02, ci95=(0.0, 1.0), free=True)
+        return Fit(rf.Model(RUBBED), 0.0, "converged", (estimate,), {}, np.array([[4e-4]]), (name,), 1)
+
+    drawn = list(credible_models(fit_of(0.01), 400, seed=3).values())[1:]
+    levels = np.array([m.mechanism.named_values[name] for m in drawn])
+    cut = scipy.stats.truncnorm(-0.5, np.inf, loc=0.01, scale=0.02)
+    assert np.all(levels >= 0) and np.mean(levels) == pytest.approx(cut.mean(), abs=3 * cut.std() / 20)
+    with pytest.raises(InputError, match="almost wholly outside"):
+        credible_models(fit_of(-1.0), 1)
 
 
 def test_names_become_no_code():

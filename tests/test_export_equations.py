@@ -96,6 +96,13 @@ def test_goal_of_a_servo_is_no_voltage():
     assert state_space(paper()).inputs == ("voltage",)
 
 
+def test_a_memory_about_a_motion_has_its_steady_value():
+    """While the joint slides at w, z = 1, where dz/dt = (speed - |speed| z) / presliding has these slopes."""
+    m = paper(**JOINT) + Dahl("joint", level=0.02, presliding=0.004)
+    linear = state_space(Model(m), speeds=(0.0, 3.0))
+    np.testing.assert_allclose(linear.A[4], [0, 0, 0, 0, -3.0 / 0.004], atol=1e-9)
+
+
 def test_quadratic_drag_about_a_speed():
     m = paper(**JOINT) + QuadraticDrag("hub", coefficient=0.003)
     at_rest, turning = (state_space(Model(m), speeds=(w, 0.0)).A[2, 2] for w in (0.0, 5.0))
