@@ -270,6 +270,18 @@ def test_other_values_compile_nothing_again(short: list[Recording]) -> None:
         assert values_at._cache_size() == compiled + 1
 
 
+def test_a_refused_step_is_cut_to_the_minimum_of_the_parabola() -> None:
+    """From 0.5 a step of one along a steep parabola gains nothing, and its half is the minimum."""
+    points = []
+
+    def parabola(p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        points.append(float(p[0, 0]))
+        return 50 * p[:, 0] ** 2, 100 * p
+
+    (found,) = descend(parabola, np.array([[0.5]]), 20)
+    assert found.status == "minimum" and points == [0.5, -0.5, 0.0]
+
+
 def test_descent_survives_points_without_a_value() -> None:
     def banana(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Rosenbrock's function plus an exponential, as steep as the error of a diverging filter."""
