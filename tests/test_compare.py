@@ -11,10 +11,12 @@ import pytest
 
 import rotflex_jax as rf
 from rotflex_jax.arena.simulator.records import make_record
+from rotflex_jax.basis import Delays, Volterra
 from rotflex_jax.cli import app
 from rotflex_jax.compare import ARX, METHODS, QUICK, Comparison, Fitted, Method, physics, register
 from rotflex_jax.compare.arx import DifferenceEquation, fit_difference_equation
 from rotflex_jax.compare.method import divergence_reason, hide_outputs, windowed_runs
+from rotflex_jax.compare.series import ChannelSeries
 from rotflex_jax.discover import Discovery
 from rotflex_jax.mechanism import simulate
 from rotflex_jax.models.model import Model
@@ -188,6 +190,17 @@ def test_a_method_cannot_cheat() -> None:
     m = seen.n_init
     np.testing.assert_array_equal(seen.y[:m], table.test[0].y[:m])
     assert np.ptp(seen.y[m:], axis=0).tolist() == [0, 0]
+
+
+def test_a_series_finds_the_input_before_its_recording_from_the_first_outputs() -> None:
+    """Reference: a convolution in numpy with an input that was constant before the recording."""
+    basis, rng = Volterra(Delays(20), order=1), np.random.default_rng(2)
+    weights = np.append(0.0, 0.8 ** np.arange(20.0))  # of the constant, then of each delay
+    u = np.append(np.ones(100), rng.normal(size=60))
+    y = np.convolve(u, weights[1:])[: len(u)]
+    series = ChannelSeries(basis, weights, False, 0.01, noise=1e-6, mean=0.0, spread=1.0)
+    # Without the past, samples after these outputs miss up to 0.5; its prior leaves a little.
+    np.testing.assert_allclose(series.simulate(u[100:], y[100:110]), y[100:], atol=0.03)
 
 
 @pytest.mark.parametrize(("ranges", "diverges"), [(99.0, False), (101.0, True)])

@@ -97,6 +97,22 @@ def test_the_smoother_is_that_of_rauch_tung_and_striebel():
         assert float(log_likelihood(*arrays)) == pytest.approx(total, rel=1e-10)
 
 
+def test_a_torque_that_no_sample_shows_is_as_uncertain_at_the_first_sample_as_at_any_other():
+    """The variance of an Ornstein-Uhlenbeck process of intensity q and time constant T is q T / 2."""
+    T, q, N = 3.0, 2.0, 30
+    decay = np.exp(-0.1 / T)
+    growth = np.array([T / 2 * (1 - decay**2)])
+    estimator = IntensityEstimator(
+        np.ones(1), growth, time_constant=T, smallest=1e-9, largest=1e9, states=1, torques=1
+    )
+    A, none = np.tile(np.diag([0.5, decay]), (1, N, 1, 1)), np.zeros((1, N, 1, 2))
+    start = InitialDistribution(np.zeros((1, 2)), np.ones((1, 2)))
+    with double_precision():
+        model = LinearTimeVaryingModel(A, none[:, :, 0], none, np.zeros((1, N, 1)), np.zeros((1, N)))
+        _, std = estimator.smooth(jax.tree.map(jnp.asarray, model), start, np.array([q]))
+    np.testing.assert_allclose(std[0, :, 1], np.sqrt(q * T / 2), rtol=1e-9)
+
+
 def test_without_process_noise_it_is_least_squares():
     """The inverse of the textbook does not exist in this case; reference: regression of the first state."""
     model, start, noise, Q = time_varying_model(N=12)
