@@ -61,6 +61,32 @@ def test_the_interval_in_white_noise_is_that_of_a_regression() -> None:
     assert np.mean(widths) == pytest.approx(2 * 1.96 * np.sqrt(2 / N), rel=0.1)
 
 
+def test_the_spectrum_of_white_noise_is_flat_at_its_level() -> None:
+    """White noise of standard deviation s has the amplitude density s sqrt(2 Ts) per root Hz."""
+    n = 20_000
+    torque = 0.3 * np.random.default_rng(0).standard_normal((n, 1))
+    none = np.zeros((n, 1))
+    found = LatentTorque(
+        ports=("hub",),
+        torque=torque,
+        std=none,
+        time=Ts * np.arange(n),
+        position=none,
+        speed=none,
+        voltage=none[:, 0],
+        recording=np.zeros(n, int),
+        Ts=(Ts,),
+        intensity={"hub": 1.0},
+        gain_nats={"hub": 0.0},
+        scale=1.0,
+        linear={},
+    )
+    f, density = found.spectrum("hub")
+    assert f[-1] == pytest.approx(0.5 / Ts)
+    for part in np.array_split(density[:-1] ** 2, 4):
+        assert np.mean(part) == pytest.approx(0.3**2 * 2 * Ts, rel=0.1)
+
+
 def test_two_sines_are_two() -> None:
     x = coloured(np.random.default_rng(1)) + np.sin(2 * np.pi * 5 * T) + 2 * np.cos(2 * np.pi * 23 * T)
     lines = periodic_torques(x, excitation.noise(N, Ts, seed=1), Ts)
