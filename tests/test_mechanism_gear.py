@@ -30,6 +30,7 @@ from rotflex_jax.mechanism import (
     simulate_states,
 )
 from rotflex_jax.mechanism.assembly import Layout
+from rotflex_jax.mechanism.gear import delayed
 from rotflex_jax.models.model import Model
 from rotflex_jax.parameters import Transform
 from rotflex_jax.recording import Recording
@@ -197,6 +198,15 @@ def by_events(u: np.ndarray, hold: int, share: float, inductance: float | None =
                 x[4] += before - x[3]
                 x[2], x[5] = x[0] + side * GAP, x[3]
     return np.array(out)
+
+
+def test_a_torque_that_begins_with_an_impact_acts_for_the_rest_of_the_step():
+    """From rest, a unit acceleration for the time 1 - t gives the speed 1 - t and the way (1 - t)^2 / 2."""
+    layout = Layout.of(joint().structure)
+    positions = np.isin(np.arange(layout.linear), [*range(layout.n), layout.rotor])
+    whole, rest = jnp.asarray(np.where(positions, 0.5, 1.0)), 1 - 0.25
+    expected = np.where(positions, rest**2 / 2, rest)
+    np.testing.assert_allclose(delayed(jnp.asarray(0.25), whole, layout), expected, rtol=1e-6)
 
 
 @pytest.mark.parametrize("share", [0.3, 0.8])
