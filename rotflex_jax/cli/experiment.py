@@ -279,23 +279,22 @@ def _limits(model: Any, voltage: float, slew: float, travel: float, deflection: 
     from rotflex_jax.mechanism.linear import output_units
     from rotflex_jax.models.model import Model
 
-    outputs = list(output_units(Model.of(model).mechanism).items())
-    found = []
-    for option, value, (channel, unit) in zip(
-        ("--travel", "--deflection"), (travel, deflection), [*outputs, ("", "")], strict=False
-    ):
+    units = output_units(Model.of(model).mechanism)
+    if len(units) == 1 and deflection != math.inf:
+        raise InputError(
+            f"--deflection {deflection:g} was given, but the model has one output, {', '.join(units)}; limit "
+            "it with --travel."
+        )
+    found = [math.inf, math.inf]
+    given_limits = (("--travel", travel), ("--deflection", deflection))
+    for i, ((option, value), unit) in enumerate(zip(given_limits, units.values(), strict=False)):
         of_one, shown = as_read(1.0, unit)  # degrees per radian, millimetres per metre
         if not value > 0:
             raise InputError(
                 f"{option} was given {value:g}, but needs a positive number in {shown}; give what the "
                 "machine bears."
             )
-        if not channel and math.isfinite(value):
-            raise InputError(
-                f"{option} {value:g} was given, but the model has one output, {outputs[0][0]}; limit it with "
-                "--travel."
-            )
-        found.append(value / of_one)
+        found[i] = value / of_one
     return Limits(voltage, slew, *found)
 
 
