@@ -102,6 +102,14 @@ def test_text_of_many_hands(header: str, delimiter: str, comma: bool, tmp_path: 
     assert_is_the_run(load(path))
 
 
+@pytest.mark.parametrize("mark", [";", "\t", ","])
+def test_a_first_line_for_excel_names_the_delimiter(mark: str, tmp_path: Path) -> None:
+    write_text(tmp_path / "run.csv", mark.join(("t", "voltage", "theta", "alpha")), mark)
+    plain = (tmp_path / "run.csv").read_text()
+    (tmp_path / "run.csv").write_text(f"sep={mark}\n{plain}")
+    assert_is_the_run(load(tmp_path / "run.csv"))
+
+
 def test_windows_line_ends(tmp_path: Path) -> None:
     path = write_text(tmp_path / "run.csv")
     path.write_bytes(path.read_bytes().replace(b"\n", b"\r\n") + b"\r\n\r\n")

@@ -3,6 +3,7 @@
 import csv
 import json
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -169,9 +170,10 @@ def unreadable(path: Path, what: str, error: Exception) -> InputError:
 def table_from_text(path: Path, max_bytes: int = MAX_BYTES) -> Table:
     """The columns of a text file in UTF-8 with a header.
 
-    The delimiter is the first of tab, semicolon, bar and comma that the header contains, otherwise
-    spaces. With a delimiter other than the comma, a comma is a decimal comma. Remark lines with # or % may
-    come first; the last of them may be the header. A line of units may follow the header.
+    The delimiter is that of a first line such as `sep=;`, which is for Excel, otherwise the first of tab,
+    semicolon, bar and comma that the header contains, otherwise spaces. With a delimiter other than the
+    comma, a comma is a decimal comma. Remark lines with # or % may come first; the last of them may be the
+    header. A line of units may follow the header.
 
     Raises:
         InputError: the file has no text, another encoding, no header, no samples, a line with more or fewer
@@ -179,10 +181,13 @@ def table_from_text(path: Path, max_bytes: int = MAX_BYTES) -> Table:
     """
     text = _decoded(path, max_bytes)
     lines = text.splitlines()
+    told = re.fullmatch(r"sep=(.)", lines[0]) if lines else None
+    if told:
+        lines[0] = ""
     start = _header(lines)
     if start is None:
         raise InputError(f"{path.name} has no text in it; export the recording again.")
-    delimiter = next((mark for mark in "\t;|," if mark in lines[start]), None)
+    delimiter = told[1] if told else next((mark for mark in "\t;|," if mark in lines[start]), None)
     names = [name.strip() for name in _cells(lines[start].lstrip("#% "), delimiter)]
     if _are_numbers(names):
         raise InputError(
