@@ -210,3 +210,19 @@ def test_the_largest_reading_is_the_top_of_the_characteristic():
     bent = fx.SensorCubic("alpha", cubic=-2.0)
     assert bent.largest_reading() == pytest.approx(float(np.max(bent.measure(v))), rel=1e-8)
     assert fx.SensorCubic("alpha", cubic=2.0).largest_reading() == math.inf
+
+
+def test_a_bias_has_the_unit_of_its_channel(tmp_path):
+    m = rf.Mechanism(
+        ("a",),
+        {"shaft": (1,)},
+        [fx.Inertia("shaft", inertia=0.1), fx.Motor("shaft"), fx.CurrentMeter("shaft")],
+        outputs={"angle": "shaft", "tacho": ("shaft", "speed"), "amps": ("shaft", "current")},
+    )
+    for channel, unit in {"angle": "rad", "tacho": "rad/s", "amps": "A"}.items():
+        m = m + fx.SensorBias(channel, bias=0.02)
+        assert m.parameter_specifications[-1].unit == unit
+        assert f"+0.02 {unit}" in m.sentence(m.effects[-1])
+    assert str(m).endswith("tacho.sensor_bias.bias = 0.02 rad/s\n  amps.sensor_bias.bias = 0.02 A")
+    Model(m).save(tmp_path / "model.json")
+    assert Model.load(tmp_path / "model.json").mechanism == m

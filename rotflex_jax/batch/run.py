@@ -20,8 +20,8 @@ from rotflex_jax.discover import discover
 from rotflex_jax.errors import InputError
 from rotflex_jax.joints.by_name import choose
 from rotflex_jax.mechanism import Mechanism
-from rotflex_jax.mechanism.linear import output_units, units_to_read
-from rotflex_jax.models.model import Model
+from rotflex_jax.mechanism.linear import output_units
+from rotflex_jax.models.model import Model, units_to_read
 from rotflex_jax.recording import Recording
 
 

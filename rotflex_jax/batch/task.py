@@ -25,8 +25,7 @@ from rotflex_jax.discover.explanation import Explanation, remaining_failures
 from rotflex_jax.effects import CATALOG
 from rotflex_jax.errors import InputError
 from rotflex_jax.joints.by_name import imported
-from rotflex_jax.mechanism.linear import check_units_of_file
-from rotflex_jax.models.model import Model
+from rotflex_jax.models.model import Model, check_units_of_file
 from rotflex_jax.recording import Recording
 from rotflex_jax.runtime.xla import enable_fast_start
 

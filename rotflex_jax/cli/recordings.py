@@ -105,7 +105,7 @@ class Columns:
         if not file.exists():
             raise InputError(f"{file} does not exist; give the path of a recording.")
         from rotflex_jax.data import load
-        from rotflex_jax.mechanism.linear import check_units_of_file
+        from rotflex_jax.models.model import check_units_of_file
 
         recording = load(file, **self.reading())
         if self.mechanism is not None:
@@ -115,7 +115,7 @@ class Columns:
     def reading(self) -> dict[str, Any]:
         """The options as arguments of `rotflex_jax.load`."""
         from rotflex_jax.data.columns import named_outputs
-        from rotflex_jax.mechanism.linear import units_to_read
+        from rotflex_jax.models.model import units_to_read
 
         units = {} if self.mechanism is None else units_to_read(self.mechanism, self.input)
         channels, told = _channels(self.outputs or (), self.mechanism.channels if self.mechanism else ())

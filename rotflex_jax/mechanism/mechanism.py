@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Real
 
 from rotflex_jax import checks
 from rotflex_jax.checks import number, shown
-from rotflex_jax.effects.base import DryFriction, Effect, Linear, Memory, driven_place, name_prefix
+from rotflex_jax.effects.base import DryFriction, Effect, Linear, Memory, Sensing, driven_place, name_prefix
 from rotflex_jax.effects.labels import effect_label
 from rotflex_jax.errors import InputError
 from rotflex_jax.mechanism.quantity import TURNING, Quantity, Units
@@ -386,19 +386,27 @@ class Mechanism:
     @functools.cached_property
     def parameter_specifications(self) -> tuple[Specification, ...]:
         """Unit, bounds and typical size of each parameter, in the order of `values`."""
-        u = self.units
         return tuple(
-            dataclasses.replace(s, unit=u.of(e, s.unit), typical=s.typical * u.size(s.unit))
+            dataclasses.replace(
+                s, unit=self.units_of(e).of(e, s.unit), typical=s.typical * self.units.size(s.unit)
+            )
             for e in self.effects
             for s in specifications(e).values()
         )
+
+    def units_of(self, effect: Effect) -> Units:
+        """Units of the parameters of an effect: a sensor has that of its channel in the place of `rad`."""
+        if not isinstance(effect, Sensing) or effect.at not in self.channels:
+            return self.units
+        return self.units._replace(motion=self.quantities[self.channels.index(effect.at)].unit(self.units))
 
     def sentence(self, effect: Effect) -> str:
         """An effect in words, in the units of this mechanism; a signal keeps its own name and unit."""
         per = f" per {effect.signal_unit}" if effect.signal_unit else ""
         own = [re.escape(part) for part in (effect.signal_name, per) if part]
         parts = re.split(f"({'|'.join(own)})", effect.sentence()) if own else [effect.sentence()]
-        parts[::2] = [self.units.sentence(part, effect.volts_of_input) for part in parts[::2]]
+        units = self.units_of(effect)
+        parts[::2] = [units.sentence(part, effect.volts_of_input) for part in parts[::2]]
         return "".join(parts)
 
     @property
@@ -523,7 +531,7 @@ class Mechanism:
                 full = e.full_name(name)
                 held = {"held": "  (trusted)", "": ""}.get(state := self._status(full), f"  ({state})")
                 number = value if not isinstance(value, (int, float)) else f"{value:.6g}"
-                unit = self.units.of(e, specifications(e)[name].unit)
+                unit = self.units_of(e).of(e, specifications(e)[name].unit)
                 lines.append(f"  {full} = {number} {unit}{held}")
         return "\n".join(lines)
 

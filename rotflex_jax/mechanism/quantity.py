@@ -81,7 +81,8 @@ class Units(NamedTuple):
         if (self.motion, self.effort, powers.get("s", 0), E, Q) == ("m", "N", 2, 1, -1):
             powers, E, Q = {"kg": 1} | {k: v for k, v in powers.items() if k != "s"}, 0, 0
         whole: dict[str, int] = {}
-        for name, power in ((self.effort, E), *powers.items(), (self.motion, Q)):
+        moved = [(name, power * Q) for name, power in _powers(self.motion).items()]  # `rad/s` of a sensor
+        for name, power in ((self.effort, E), *powers.items(), *moved):
             whole[name] = whole.get(name, 0) + power
         return _written(whole)
 

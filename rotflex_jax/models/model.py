@@ -396,3 +396,50 @@ class Model:
                 jnp.asarray(float(recording.Ts)),
             )
             return np.asarray(run[1])
+
+
+def units_to_read(mechanism: Mechanism, input: str | None = None) -> dict[str, str]:
+    """Units that `rotflex_jax.load` takes only if it is told: those that are not rad, or V for the input.
+
+    Args:
+        mechanism: Mechanism for which a file is read.
+        input: Column of its input that is named. If none is, the column of the voltage is read, which is not
+            the input of a mechanism with another unit.
+
+    Returns:
+        Channel or column of the input -> unit.
+    """
+    units = {channel: unit for channel, unit in output_units(mechanism).items() if unit != "rad"}
+    return units if input is None or mechanism.units.input == "V" else {**units, input: mechanism.units.input}
+
+
+def check_units_of_file(mechanism: Mechanism, recording: Recording) -> None:
+    """Refuses a recording of a file whose input, outputs and signals are not those of the mechanism.
+
+    `Model.measured` refuses an angle in degrees for radians alone, since a recording made in Python may name
+    its units as it likes. Here any other unit is refused: a file is read by those of the mechanism.
+
+    Raises:
+        InputError: The input or an output has another unit, which the recording does not accept, or a signal
+            is missing.
+    """
+    driven, any_unit = mechanism.units.input, "units" in recording.accept
+    if recording.input_unit != driven and not any_unit:
+        raise InputError(
+            f"{recording.source}: the input {recording.input_name!r} is in {recording.input_unit}, but the "
+            f"model is driven in {driven}; name the column of that with input=, give a model with such an "
+            "input (for a current one with CurrentDrive), or pass accept=('units',)."
+        )
+    for channel, unit in output_units(mechanism).items():
+        given = recording.unit(channel) if channel in recording.channels else unit
+        if given != unit and not any_unit:
+            raise InputError(
+                f"{recording.source}: the output {channel!r} is in {given}, but that of the model is in "
+                f"{unit}; convert the column, or pass accept=('units',)."
+            )
+    if lacking := [name for name in mechanism.signals if name not in recording.signals]:
+        has = " and ".join(map(repr, recording.signals)) or "none"
+        raise InputError(
+            f"{recording.source}: the model is driven by the signal {lacking[0]!r} beside its input, but the "
+            f"signals that were read are {has}; name its column, signals={{{lacking[0]!r}: 'COLUMN'}}."
+        )

@@ -157,7 +157,7 @@ def _effect(effect: Effect, mechanism: Mechanism) -> dict[str, Any]:
     parameters = {
         name: {
             "value": _json(float(value)),
-            "unit": mechanism.units.of(effect, declared[name].unit),
+            "unit": mechanism.units_of(effect).of(effect, declared[name].unit),
             "bounds": [_json(declared[name].lower), _json(declared[name].upper)],
             "trusted": effect.full_name(name) in mechanism.trusted,
             "meaning": declared[name].meaning,
@@ -280,7 +280,7 @@ def from_dict(data: Mapping[str, Any]) -> Saved:
         _check_settings(part.get("settings", part), part.get("effect", "the solver"))
     given = data["mechanism"]
     units = Units(*given["units"], input=given.get("input_unit", "V"))
-    built = [_effect_back(e, units) for e in given["effects"]]
+    built = [_effect_back(e) for e in given["effects"]]
     trusted = [
         full_name(e["at"], e["effect"], name)
         for e in given["effects"]
@@ -296,6 +296,8 @@ def from_dict(data: Mapping[str, Any]) -> Saved:
         units=units,
         signals=tuple(given.get("signals", ())),
     )
+    for effect, saved in zip(mechanism.effects, given["effects"], strict=True):
+        _check_units(mechanism.units_of(effect), effect, saved["parameters"])
     rule = dict(data["solver"])
     name = rule.pop("rule")
     if name not in _SOLVERS:
@@ -322,7 +324,7 @@ def from_dict(data: Mapping[str, Any]) -> Saved:
     )
 
 
-def _effect_back(given: Mapping[str, Any], units: Units) -> Effect:
+def _effect_back(given: Mapping[str, Any]) -> Effect:
     name, parameters = given["effect"], given["parameters"]
     cls = _known(name)
     if cls is None:
@@ -332,15 +334,20 @@ def _effect_back(given: Mapping[str, Any], units: Units) -> Effect:
         )
     settings = {key: _back(value) for key, value in given["settings"].items()}
     effect = cls(at=given["at"], **settings)
-    declared = cls.declared() | specifications(effect)
+    known = cls.declared() | specifications(effect)
+    return effect.replace(**{key: p["value"] for key, p in parameters.items() if key in known})
+
+
+def _check_units(units: Units, effect: Effect, parameters: Mapping[str, Any]) -> None:
+    """Refuses parameters that the effect does not have, or has in another unit."""
+    declared = effect.declared() | specifications(effect)
     for key, p in parameters.items():
         if key not in declared or units.of(effect, declared[key].unit) != p["unit"]:
             has = ", ".join(f"{n} [{units.of(effect, s.unit)}]" for n, s in declared.items())
             raise InputError(
-                f"The file gives {name!r} the parameter {key} [{p['unit']}], but the effect has {has}; "
-                f"use the version of the effect that the file was written with."
+                f"The file gives {effect.name!r} the parameter {key} [{p['unit']}], but the effect has {has}"
+                "; use the version of the effect that the file was written with."
             )
-    return effect.replace(**{key: p["value"] for key, p in parameters.items()})
 
 
 def _known(name: str) -> type[Effect] | None:
