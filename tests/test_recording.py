@@ -304,6 +304,18 @@ def test_step_is_found_whatever_its_unit_offset_and_rounding(scale: float) -> No
     assert quantisation_step(np.round(in_degrees, 3)) == pytest.approx(360 / 4096, rel=1e-4)
 
 
+@pytest.mark.parametrize("scale", [1.0, 180 / np.pi])
+@pytest.mark.parametrize("digits", range(6, 13))
+def test_step_of_the_difference_of_two_rounded_columns_is_that_of_the_encoders(
+    digits: int, scale: float
+) -> None:
+    """As where the angle of the arm is absolute: the deflection is its difference to that of the hub."""
+    _, y = swinging()
+    hub, arm = (COUNT * np.round(x / COUNT) for x in (y[:, 0], y[:, 0] + y[:, 1]))
+    deflection = (np.round(scale * arm, digits) - np.round(scale * hub, digits)) / scale
+    assert quantisation_step(deflection) == pytest.approx(COUNT, rel=1e-4)
+
+
 @pytest.mark.parametrize("seed", range(5))
 def test_noise_free_numbers_have_no_step(seed: int) -> None:
     _, y = swinging(seed=seed)

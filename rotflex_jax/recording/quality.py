@@ -9,6 +9,7 @@ angle of the arm is `theta + alpha`, and `(theta + alpha) / theta = 1 / (1 - w^2
 deflection is as large as theta at no more than one frequency; an octave above, their ratio is far from one.
 """
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -39,9 +40,20 @@ def quantisation_step(x: Float[np.ndarray, " N"]) -> float | None:
     >>> quantisation_step(np.sin(t)) is None
     True
     """
-    rounding = 16 * np.finfo(x.dtype).eps * np.max(np.abs(x))
+    arithmetic = 16 * np.finfo(x.dtype).eps * np.max(np.abs(x))
+    # A difference of two columns of a text file, perhaps in degrees there, has the rounding of both.
+    of_text = 0.0
+    for scale, digits in itertools.product((1.0, 180 / np.pi), range(3, 13)):
+        if np.max(np.abs(scale * x - np.round(scale * x, digits))) <= scale * arithmetic:
+            of_text = 2.01 * 10.0**-digits / scale
+            break
+    steps = (_lattice(x, rounding) for rounding in (of_text, arithmetic) if rounding >= arithmetic)
+    return next((float(f"{step:.10g}") for step in steps if step), None)
+
+
+def _lattice(x: Float[np.ndarray, " N"], rounding: float) -> float | None:
+    """The step of a quantised signal, in which values are one level if they differ by `rounding` or less."""
     levels = np.unique(x).astype(np.float64)
-    # Values that differ only by the rounding error of arithmetic are one level.
     levels = levels[np.diff(levels, prepend=-np.inf) > rounding]
     if len(levels) < 10 or len(levels) == len(x):
         return None
@@ -54,7 +66,7 @@ def quantisation_step(x: Float[np.ndarray, " N"]) -> float | None:
         if step < 100 * rounding:
             break
         if np.max(np.abs(levels - levels.mean() - step * spread)) < 0.05 * step:
-            return float(f"{step:.10g}")
+            return step
     return None
 
 
