@@ -165,7 +165,7 @@ def mapped(found: MapEquations, weights: int, prior: float = 1e-3) -> FittedMap:
         {},
         Whitener(np.eye(1)),
     )
-    return FittedMap(h, np.eye(weights), V, False, at)
+    return FittedMap(h, V, False, at)
 
 
 @pytest.mark.parametrize(

@@ -307,7 +307,7 @@ def test_a_nested_direction_does_not_count():
 
 @pytest.mark.parametrize(("other", "counts"), [(500.0, True), (5.0, False)])
 def test_a_direction_that_decides_counts_though_the_opposite_is_far_more_distinct(problem, other, counts):
-    one, two = (RivalFit(np.zeros(1), nats, np.zeros((1, 2)), 0.0, 1) for nats in (20_000.0, other))
+    one, two = (RivalFit(np.zeros(1), nats, np.zeros((1, 2)), 0.0) for nats in (20_000.0, other))
     result = Discrimination(np.zeros((2, 1, 2)), (one, two))
     assert problem.without_nested_direction([result]).counted == (True, counts)
 

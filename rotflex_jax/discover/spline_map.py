@@ -107,14 +107,12 @@ class FittedMap:
 
     Attributes:
         hypothesis: The hypothesis with the weights of the map among its free parameters.
-        basis: Basis (in columns) of the weights that the physics cannot imitate.
         covariance: Covariance of the weights in unconstrained coordinates, with everything else free.
         flat: Whether the map hardly depends on the position, by its smoothness.
         equations: Normal equations at the fit.
     """
 
     hypothesis: Hypothesis
-    basis: Float[np.ndarray, "W D"]
     covariance: Float[np.ndarray, "W W"]
     flat: bool
     equations: MapEquations
@@ -167,7 +165,6 @@ def fit_map(
     H = basis.T @ (equations.projected()[0] / equations.excess + _weighted(S, smoothness)) @ basis
     return FittedMap(
         current,
-        basis,
         basis @ np.linalg.inv(H) @ basis.T,
         bool(smoothness[0] > FLAT_SMOOTHNESS * loosest),
         equations,

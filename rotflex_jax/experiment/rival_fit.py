@@ -176,14 +176,12 @@ class RivalFit:
         nats: Half the squared whitened residuals that remain after an exact projection [nat].
         residuals: Whitened innovations of the rival on the run of the true model.
         predicted_gain: Gain of a further step to first order [nat]; small at convergence.
-        steps: Gauss-Newton steps taken.
     """
 
     unknowns: Float[np.ndarray, " D"]
     nats: float
     residuals: Float[np.ndarray, "N C"]
     predicted_gain: float
-    steps: int
 
     @property
     def converged(self) -> bool:
@@ -314,11 +312,10 @@ def fit_rival(
         first = rival.start if start is None else start
         limit = limits_of_unknowns(rival.transform.bounded[list(rival.free)], first)
         found = minimise(linearised, first, RULES, limit=limit, max_steps=MAX_STEPS - 1)
-    steps = found.evaluations + 1
     if found.status == Status.DIVERGED:
-        return RivalFit(found.x, np.inf, np.full_like(y, np.inf), np.inf, steps)
+        return RivalFit(found.x, np.inf, np.full_like(y, np.inf), np.inf)
     nats = found.equations.projected_cost()
-    return RivalFit(found.x, nats, found.equations.residuals, found.cost - nats, steps)
+    return RivalFit(found.x, nats, found.equations.residuals, found.cost - nats)
 
 
 @dataclasses.dataclass(frozen=True)

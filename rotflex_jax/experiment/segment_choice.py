@@ -112,11 +112,11 @@ class SegmentChoice:
             loose = cov if goes_on else cov * np.outer(1 - spread, 1 - spread)
             w, V = np.linalg.eigh((loose + loose.T) / 2)
             steps = (V * np.sqrt(np.maximum(w, 0))) @ self.rng.standard_normal((len(w), DRAWS))
-            drawn.append([(self._likely(h, v, seeds[: len(d)].T @ d), state + slope_x @ d) for d in steps.T])
+            drawn.append([(self._likely(v, seeds[: len(d)].T @ d), state + slope_x @ d) for d in steps.T])
         self.values, self.x0, self.drawn = np.array(values), np.array(x0), drawn
         self.machine_own = [len(r.free[h]) + o + q for h in range(r.count)]
 
-    def _likely(self, h: int, values: np.ndarray, change: np.ndarray) -> np.ndarray:
+    def _likely(self, values: np.ndarray, change: np.ndarray) -> np.ndarray:
         """Values of a draw: physical values after a change, at some distance from their bounds.
 
         A change of a hardly known logarithm would enlarge a small effect out of all proportion.

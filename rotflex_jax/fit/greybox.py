@@ -306,7 +306,7 @@ def _problem(
     restarts: int,
     minimiser: "Minimiser | None",
     devices: Sequence[Any] | None,
-    progress: Callable[[str], None] | None,
+    say: Callable[[str], None],
 ) -> GreyBoxProblem:
     m = model.mechanism
     mesh = mesh_of(devices)
@@ -319,6 +319,6 @@ def _problem(
         max_steps,
         restarts,
         minimiser,
-        progress or (lambda _: None),
+        say,
         None,
     )

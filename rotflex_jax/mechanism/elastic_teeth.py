@@ -122,13 +122,11 @@ class ToothContact(NamedTuple):
     """Teeth in contact for a part of a step.
 
     Attributes:
-        start: Fraction of the step at which the contact begins.
         impulse: Integral of the torque over the step, in units of the step.
         moments: First three moments of the torque over the step.
         lasts: Whether the teeth are in contact at the end of the step.
     """
 
-    start: Float[Array, "*S"]
     impulse: Float[Array, "*S"]
     moments: Float[Array, "3 *S"]
     lasts: Bool[Array, "*S"]
@@ -173,7 +171,7 @@ def contact(
     area = way - (flight.integral(t) - flight.integral(start))
     moments = -jnp.stack([slower, t * slower - behind, t * t * slower - 2 * t * behind + 2 * area])
     moments = jnp.where(touching[None], mass[None] * moments, 0.0)
-    return ToothContact(start, moments[0], moments, touching & ~ends)
+    return ToothContact(moments[0], moments, touching & ~ends)
 
 
 def _until_zero(o: Oscillator, span: Array) -> Array:
