@@ -29,7 +29,13 @@ from rotflex_jax.experiment.rival_fit import (
 )
 from rotflex_jax.experiment.segment_choice import SegmentChoice
 from rotflex_jax.experiment.sequential import sequential_experiment
-from rotflex_jax.experiment.standard_inputs import REDUCED_AMPLITUDES, Limits, StandardInput, standard_inputs
+from rotflex_jax.experiment.standard_inputs import (
+    REDUCED_AMPLITUDES,
+    Limits,
+    StandardInput,
+    checked_limits,
+    standard_inputs,
+)
 from rotflex_jax.experiment.until_decided import models_of
 from rotflex_jax.fit.result import Fit
 from rotflex_jax.mechanism import Mechanism
@@ -177,11 +183,7 @@ def next_experiment(
         )
     fitted = (model.model if isinstance(model, Fit) else Model.of(model)).without_gates()
     check_input_alone(fitted.mechanism, "a designed experiment")
-    if not isinstance(limits, Limits):
-        raise InputError(
-            f"Argument `limits` must be Limits(voltage=...), but is {checks.shown(limits)}; give what the "
-            "machine bears."
-        )
+    checked_limits(limits)
     starts, looks = checks.whole(starts, "starts", 0), checks.whole(looks, "looks", 1)
     reference = None if reference is None else checks.signal(reference, "reference")
     N, P = sample_counts(seconds, Ts)

@@ -13,7 +13,7 @@ from rotflex_jax import checks
 from rotflex_jax.data.files import load
 from rotflex_jax.errors import InputError
 from rotflex_jax.experiment.result import voltage_file
-from rotflex_jax.experiment.standard_inputs import Limits
+from rotflex_jax.experiment.standard_inputs import Limits, checked_limits
 from rotflex_jax.mechanism import Mechanism, simulate
 from rotflex_jax.mechanism.mechanism import check_input_alone
 from rotflex_jax.models.model import Model
@@ -174,17 +174,3 @@ class FileRig(Rig):
                 )
             time.sleep(0.05)
         return load(answer, **self.columns)
-
-
-def checked_limits(limits: Any) -> Limits:
-    """The limits, checked.
-
-    Raises:
-        InputError: The argument is no `Limits`.
-    """
-    if not isinstance(limits, Limits):
-        raise InputError(
-            f"Argument `limits` must be Limits(voltage=...), but is {checks.shown(limits)}; give what the "
-            "machine bears."
-        )
-    return limits

@@ -21,10 +21,9 @@ from rotflex_jax import checks
 from rotflex_jax.errors import InputError
 from rotflex_jax.experiment.common_structure import UNKNOWN_SHARE, rival_set
 from rotflex_jax.experiment.result import Segment, SequentialResult, SequentialStep, json_limits
-from rotflex_jax.experiment.rig import checked_limits
 from rotflex_jax.experiment.rival_set import RivalPosterior, RivalSet, RunData
 from rotflex_jax.experiment.segment_choice import BEFORE, SegmentChoice
-from rotflex_jax.experiment.standard_inputs import Limits
+from rotflex_jax.experiment.standard_inputs import Limits, checked_limits
 from rotflex_jax.mechanism.quantity import input_word
 from rotflex_jax.models import model_json
 from rotflex_jax.recording import Recording

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -81,6 +82,20 @@ class Limits:
         low, low_source = _lower_envelope(inside, step)
         high, high_source = _lower_envelope(-inside, step)
         return (low - high) / 2, low_source, high_source
+
+
+def checked_limits(limits: Any) -> Limits:
+    """The limits, checked.
+
+    Raises:
+        InputError: The argument is no `Limits`.
+    """
+    if not isinstance(limits, Limits):
+        raise InputError(
+            f"Argument `limits` must be Limits(voltage=...), but is {shown(limits)}; give what the "
+            "machine bears."
+        )
+    return limits
 
 
 def _lower_envelope(u: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:

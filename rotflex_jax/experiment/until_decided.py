@@ -8,7 +8,7 @@ from rotflex_jax.effects import CATALOG
 from rotflex_jax.errors import InputError
 from rotflex_jax.experiment.common_structure import UNKNOWN_SHARE
 from rotflex_jax.experiment.result import SequentialResult
-from rotflex_jax.experiment.rig import Rig, checked_limits
+from rotflex_jax.experiment.rig import Rig
 from rotflex_jax.experiment.sequential import (
     ERROR,
     MOST_SECONDS,
@@ -16,6 +16,7 @@ from rotflex_jax.experiment.sequential import (
     Progress,
     sequential_experiment,
 )
+from rotflex_jax.experiment.standard_inputs import checked_limits
 from rotflex_jax.fit.greybox import fit
 from rotflex_jax.mechanism.mechanism import check_input_alone
 
