@@ -141,7 +141,7 @@ class LearnedTorqueResult:
 
     def plot(self) -> "Figure":
         """Figure of the map (grey where recordings have not been), its profiles with bands, the formula."""
-        from rotflex_jax.discover.learned_torque_figure import learned_figure  # the layer above, on request
+        from rotflex_jax.discover.learned_torque_figure import learned_figure  # takes long to import
 
         return learned_figure(self)
 

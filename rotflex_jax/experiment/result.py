@@ -164,7 +164,7 @@ class Experiment:
 
     def plot(self) -> Any:
         """Figure: input over time, its spectrum, and predicted difference of the models with sensor noise."""
-        from rotflex_jax.experiment.figure import experiment_figure  # the layer above, on request
+        from rotflex_jax.experiment.figure import experiment_figure  # takes long to import
 
         return experiment_figure(self)
 
@@ -260,7 +260,7 @@ class Segment:
 
     def plot(self) -> Any:
         """Figure: the input, and the prediction of each model less the mean of all predictions."""
-        from rotflex_jax.experiment.figure import segment_figure  # the layer above, on request
+        from rotflex_jax.experiment.figure import segment_figure  # takes long to import
 
         return segment_figure(self)
 
@@ -406,7 +406,7 @@ class SequentialResult:
 
     def plot(self) -> Any:
         """Figure: probabilities over the time on the rig, the voltage, and the recorded outputs."""
-        from rotflex_jax.experiment.figure import sequential_figure  # the layer above, on request
+        from rotflex_jax.experiment.figure import sequential_figure  # takes long to import
 
         return sequential_figure(self)
 

@@ -15,6 +15,7 @@ from rotflex_jax.fit.plausibility import Remark
 from rotflex_jax.mechanism.linear import output_units
 from rotflex_jax.models.comparison import compare_plot
 from rotflex_jax.models.model import Model
+from rotflex_jax.models.model_json import Saved, save
 from rotflex_jax.parameters import HALF_WIDTH_95, Estimate
 from rotflex_jax.recording import Recording
 from rotflex_jax.text.markup import card, paragraph, picture, table
@@ -162,8 +163,6 @@ class Fit:
 
     def save(self, path: str | Path) -> Path:
         """Write model, estimates, covariance and sampling period as JSON; `Model.load` reads the model."""
-        from rotflex_jax.models.model_json import Saved, save  # the layer above, on request
-
         own = self.model, self.parameters, self.covariance, self.free_names
         return save(Saved(*own, self.Ts, self.n_init), path)
 

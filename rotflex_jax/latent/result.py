@@ -297,7 +297,7 @@ class LatentTorque:
         Args:
             after: Latent torques of a better model over the same recordings, drawn as well.
         """
-        from rotflex_jax.latent.figure import latent_maps  # the layer above, on request
+        from rotflex_jax.latent.figure import latent_maps  # takes long to import
 
         return latent_maps(self, after)
 
