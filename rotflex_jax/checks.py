@@ -14,6 +14,8 @@ from rotflex_jax.errors import InputError
 
 Given = ParamSpec("Given")
 Made = TypeVar("Made")
+Progress = Callable[[str], Any]
+"""Function that receives lines of text on the progress of a computation."""
 
 
 def shown(value: Any) -> str:
@@ -262,7 +264,7 @@ def names(value: Any, name: str) -> tuple[str, ...]:
     raise InputError(f"Argument `{name}` must be a list of names, but is {shown(value)}; {hint}.")
 
 
-def progress(given: Any) -> Callable[[str], Any]:
+def progress(given: Any) -> Progress:
     """The function that receives lines of progress; for None, a function that does nothing."""
     if given is None:
         return lambda _: None

@@ -11,7 +11,8 @@ from jaxtyping import Array, Float, Int
 
 from rotflex_jax.adaptive import LMS, NLMS, RLS, AdaptiveFilter, Kalman, grid, run, tune
 from rotflex_jax.basis import Volterra
-from rotflex_jax.compare.method import Fitted, Progress, require_one_sampling_period
+from rotflex_jax.checks import Progress
+from rotflex_jax.compare.method import Fitted, require_one_sampling_period
 from rotflex_jax.compare.series import (
     RIDGES,
     BankKind,

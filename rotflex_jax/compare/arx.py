@@ -6,9 +6,9 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
+from rotflex_jax.checks import Progress
 from rotflex_jax.compare.method import (
     Fitted,
-    Progress,
     require_one_sampling_period,
     split_for_validation,
     validation_cost,

@@ -7,9 +7,9 @@ import numpy as np
 import scipy
 from jaxtyping import Complex, Float
 
+from rotflex_jax.checks import Progress
 from rotflex_jax.compare.method import (
     Fitted,
-    Progress,
     require_one_sampling_period,
     split_for_validation,
     validation_cost,

@@ -11,14 +11,12 @@ import numpy as np
 from jaxtyping import Float
 
 from rotflex_jax import metrics
-from rotflex_jax.checks import choose, shown
+from rotflex_jax.checks import Progress, choose, shown
 from rotflex_jax.errors import InputError
 from rotflex_jax.models.model import Model
 from rotflex_jax.recording import Recording
 from rotflex_jax.recording.quality import ACCEPTABLE
 from rotflex_jax.recording.samples import of_one_period
-
-Progress = Callable[[str], None]
 
 
 @runtime_checkable

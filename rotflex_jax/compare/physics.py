@@ -6,7 +6,8 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 from jaxtyping import Float
 
-from rotflex_jax.compare.method import Fitted, Progress, split_for_validation
+from rotflex_jax.checks import Progress
+from rotflex_jax.compare.method import Fitted, split_for_validation
 from rotflex_jax.discover import discover
 from rotflex_jax.discover.learned_torque import learn_torque
 from rotflex_jax.discover.likelihood import MAX_PROCESS_NOISE_SHARE

@@ -7,9 +7,9 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from rotflex_jax import checks, joints
+from rotflex_jax.checks import Progress
 from rotflex_jax.compare.method import (
     Method,
-    Progress,
     divergence_reason,
     error_metrics,
     errors_by_horizon,

@@ -10,8 +10,9 @@ from jaxtyping import Float
 
 from rotflex_jax.basis import Orthonormal, Volterra
 from rotflex_jax.basis.bank import Averages, Bank
+from rotflex_jax.checks import Progress
 from rotflex_jax.compare.linear_models import chosen_system, refined
-from rotflex_jax.compare.method import Fitted, Progress, require_one_sampling_period
+from rotflex_jax.compare.method import Fitted, require_one_sampling_period
 from rotflex_jax.fit.linear import factor, solve
 from rotflex_jax.models.model import Model
 from rotflex_jax.recording import Recording

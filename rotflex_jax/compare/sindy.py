@@ -10,7 +10,8 @@ import numpy as np
 import scipy
 from jaxtyping import Float
 
-from rotflex_jax.compare.method import Fitted, Progress, require_one_sampling_period
+from rotflex_jax.checks import Progress
+from rotflex_jax.compare.method import Fitted, require_one_sampling_period
 from rotflex_jax.compare.sparse_equations import Piece, SparseEquations, Terms, costs, refined
 from rotflex_jax.errors import InputError
 from rotflex_jax.models.model import Model

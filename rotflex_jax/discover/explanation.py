@@ -8,6 +8,7 @@ import numpy as np
 import scipy
 from jaxtyping import Float
 
+from rotflex_jax.checks import Progress
 from rotflex_jax.discover.learned_torque import LearnedTorqueResult
 from rotflex_jax.discover.localise import locate_in_windows
 from rotflex_jax.discover.result import SearchResult, Stage, Where
@@ -15,7 +16,6 @@ from rotflex_jax.discover.verdict import Verdict
 from rotflex_jax.effects import CATALOG
 from rotflex_jax.fit.identifiable import Identifiability
 from rotflex_jax.latent import LatentTorque, latent_torque
-from rotflex_jax.latent.torque import Progress
 from rotflex_jax.models.model import Model
 from rotflex_jax.models.residual_tests import (
     FrequencyResponse,

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from rotflex_jax import checks
+from rotflex_jax.checks import Progress
 from rotflex_jax.discover.checkpoint import beginning, digest_of_search
 from rotflex_jax.discover.conclusion import with_proposal
 from rotflex_jax.discover.discovery import Discovery
@@ -28,7 +29,7 @@ from rotflex_jax.discover.likelihood import (
 )
 from rotflex_jax.discover.pairs import pairs_passed_by
 from rotflex_jax.discover.result import KnownRuns, longest_recording
-from rotflex_jax.discover.search_state import Progress, SearchState, as_it_was, fit_as_it_is
+from rotflex_jax.discover.search_state import SearchState, as_it_was, fit_as_it_is
 from rotflex_jax.discover.selection import is_poor
 from rotflex_jax.discover.stepwise import (
     Eliminated,

@@ -2,11 +2,12 @@
 
 import dataclasses
 import functools
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 
 import numpy as np
 
+from rotflex_jax.checks import Progress
 from rotflex_jax.discover.checkpoint import (
     AddedEffect,
     KeptStage,
@@ -48,8 +49,6 @@ from rotflex_jax.discover.validation import (
 from rotflex_jax.effects.base import Sensing
 from rotflex_jax.fit.plausibility import Reach, beyond_recordings
 from rotflex_jax.models.model import Model
-
-Progress = Callable[[str], None]
 
 # An effect is not plausible if it needs an offset or bias of more than this many typical sizes: 0.2 V or
 # 0.04 rad.

@@ -2,13 +2,14 @@
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any, overload
 
 import numpy as np
 from jaxtyping import Float
 
 from rotflex_jax import checks
+from rotflex_jax.checks import Progress
 from rotflex_jax.effects.base import Effect, name_prefix
 from rotflex_jax.errors import InputError
 from rotflex_jax.experiment.common_structure import noise_std
@@ -42,8 +43,6 @@ from rotflex_jax.mechanism import Mechanism
 from rotflex_jax.mechanism.linear import output_units
 from rotflex_jax.mechanism.mechanism import check_input_alone, process_noise_of
 from rotflex_jax.models.model import Model
-
-Progress = Callable[[str], None]
 
 # One period of a design [s].
 DESIGN_PERIOD = 4.0

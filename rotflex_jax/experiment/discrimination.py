@@ -5,11 +5,12 @@ the log-likelihood by which the true model is expected to win.
 """
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float, Int
 
+from rotflex_jax.checks import Progress
 from rotflex_jax.errors import InputError
 from rotflex_jax.experiment.rival_fit import (
     RivalFit,
@@ -186,8 +187,6 @@ def starts_with_other_shapes(rival: RivalModel) -> list[Float[np.ndarray, " D"]]
                 starts.append(dataclasses.replace(rival, mechanism=m).start)
     return starts
 
-
-Progress = Callable[[str], None]
 
 # Periods that are simulated in one evaluation: one from rest, the others near the periodic motion.
 SIMULATED_PERIODS = 2

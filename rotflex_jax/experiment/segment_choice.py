@@ -1,12 +1,13 @@
 """The next segment of a sequential experiment: the input after which a wrong answer is least probable."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Bool, Float
 
+from rotflex_jax.checks import Progress
 from rotflex_jax.data import excitation
 from rotflex_jax.errors import InputError
 from rotflex_jax.experiment.discrimination import (
@@ -21,8 +22,6 @@ from rotflex_jax.experiment.standard_inputs import MULTISINE_CREST, NOISE_CREST
 
 if TYPE_CHECKING:
     from rotflex_jax.experiment.sequential import SequentialExperiment
-
-Progress = Callable[[str], None]
 
 # Length of the voltage before a segment with which its simulation begins, for actuators with memory, and
 # length of the rest after it during which the machine must stay within its limits [s].

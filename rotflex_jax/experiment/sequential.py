@@ -10,7 +10,7 @@ import dataclasses
 import functools
 import json
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Float
 
 from rotflex_jax import checks
+from rotflex_jax.checks import Progress
 from rotflex_jax.errors import InputError
 from rotflex_jax.experiment.common_structure import UNKNOWN_SHARE, rival_set
 from rotflex_jax.experiment.result import Segment, SequentialResult, SequentialStep, json_limits
@@ -29,8 +30,6 @@ from rotflex_jax.models import model_json
 from rotflex_jax.recording import Recording
 from rotflex_jax.recording.quality import ACCEPTABLE, SHORTEST_RECORDING
 from rotflex_jax.text.files import write_file
-
-Progress = Callable[[str], None]
 
 SEGMENT_SECONDS, MOST_SECONDS, ERROR = 1.0, 60.0, 0.01
 SHORTEST_SEGMENT = 0.4

@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from rotflex_jax import checks
+from rotflex_jax.checks import Progress
 from rotflex_jax.effects import CATALOG
 from rotflex_jax.errors import InputError
 from rotflex_jax.experiment.common_structure import UNKNOWN_SHARE
@@ -13,7 +14,6 @@ from rotflex_jax.experiment.sequential import (
     ERROR,
     MOST_SECONDS,
     SEGMENT_SECONDS,
-    Progress,
     sequential_experiment,
 )
 from rotflex_jax.experiment.standard_inputs import checked_limits

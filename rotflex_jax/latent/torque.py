@@ -1,12 +1,13 @@
 """Torques that a model lacks, estimated from recordings by an iterated Kalman smoother."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from rotflex_jax import checks
+from rotflex_jax.checks import Progress
 from rotflex_jax.errors import InputError
 from rotflex_jax.fit.dataset import Dataset, prepare, process_noise_ports, with_common_constants
 from rotflex_jax.latent.result import LatentTorque, latent_torque_result
@@ -25,8 +26,6 @@ from rotflex_jax.models.model import Model
 from rotflex_jax.recording import Recording
 from rotflex_jax.recording.recording import SHORTEST_TO_FIT, listed
 from rotflex_jax.runtime.xla import double_precision
-
-Progress = Callable[[str], None]
 
 # Largest number of linearisations along the latest smoothed states.
 MAX_LINEARISATIONS = 4
