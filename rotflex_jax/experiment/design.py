@@ -12,7 +12,7 @@ from rotflex_jax import checks
 from rotflex_jax.checks import Progress
 from rotflex_jax.effects.base import Effect, name_prefix
 from rotflex_jax.errors import InputError
-from rotflex_jax.experiment.common_structure import noise_std
+from rotflex_jax.experiment.common_structure import UNKNOWN_SHARE, noise_std
 from rotflex_jax.experiment.discrimination import (
     MAX_EVALUATIONS,
     Discrimination,
@@ -46,8 +46,6 @@ from rotflex_jax.models.model import Model
 
 # One period of a design [s].
 DESIGN_PERIOD = 4.0
-# Uncertainty of a parameter for which no fit gives a standard deviation, as a share of its value.
-DEFAULT_UNCERTAINTY = 0.05
 # Evidence that makes one of two equally probable effects 99 % probable [nat].
 ENOUGH = math.log(99)
 
@@ -344,7 +342,7 @@ def _parameter_variations(model: Fit | Model | Mechanism, rival: RivalModel) -> 
     std = {e.name: float(e.std) for e in known if np.isfinite(e.std)}
     for i in rival.free:
         name, spec = m.parameter_names[i], m.parameter_specifications[i]
-        reach = 2 * std[name] if name in std else DEFAULT_UNCERTAINTY * abs(m.values[i])
+        reach = 2 * std[name] if name in std else UNKNOWN_SHARE * abs(m.values[i])
         for step in (-reach, reach):
             values = m.values
             values[i] = np.clip(values[i] + step, spec.lower, spec.upper)

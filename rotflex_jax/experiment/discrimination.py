@@ -13,6 +13,7 @@ from jaxtyping import Float, Int
 from rotflex_jax.checks import Progress
 from rotflex_jax.errors import InputError
 from rotflex_jax.experiment.rival_fit import (
+    SHAPE_FACTORS,
     RivalFit,
     RivalModel,
     best_rival_fit,
@@ -21,14 +22,18 @@ from rotflex_jax.experiment.rival_fit import (
 )
 from rotflex_jax.experiment.standard_inputs import Limits
 
-# Further starts of a rival fit: factors of every parameter of the rival's effect that is not an amplitude,
-# because least squares from one start finds only the local minimum of that shape.
-SHAPE_FACTORS = (0.6, 1.6)
 # A model counts as nested in its rival if the rival reproduces its run up to this share of the evidence of
 # the opposite case, or up to an evidence that no recording would decide by [nat].
 NESTED_SHARE, NEGLIGIBLE_EVIDENCE = 0.05, 10.0
 # Exponent of the smooth maximum whose gradient replaces the gradient of a peak.
 SMOOTH_MAXIMUM_EXPONENT = 24
+
+
+def peak_slope(y: Float[np.ndarray, "N C"]) -> Float[np.ndarray, "N C"]:
+    """Derivative of the logarithm of each channel's peak, a smooth maximum, by its samples."""
+    size = np.maximum(np.max(np.abs(y), axis=0), 1e-300)
+    power = np.abs(y / size) ** (SMOOTH_MAXIMUM_EXPONENT - 1) * np.sign(y)
+    return power / np.sum(np.abs(y / size) ** SMOOTH_MAXIMUM_EXPONENT, axis=0) / size
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -138,10 +143,7 @@ class DiscriminationProblem:
         """
         total = np.zeros_like(u)
         for k, fit in enumerate(result.rival_fits):
-            y = result.outputs[k]
-            size = np.maximum(np.max(np.abs(y), axis=0), 1e-300)
-            power = np.abs(y / size) ** (SMOOTH_MAXIMUM_EXPONENT - 1) * np.sign(y)
-            slope = power / np.sum(np.abs(y / size) ** SMOOTH_MAXIMUM_EXPONENT, axis=0) / size
+            slope = peak_slope(result.outputs[k])
             true, rival = self.pair[k], self.pair[1 - k]
             weight = self.counted[k] / sum(self.counted) / max(fit.nats, 1e-12)
             total += input_gradient(true, rival, fit.unknowns, u, self.Ts, weight, -penalty[k] * slope)
@@ -201,6 +203,20 @@ FIRST_ASCENT_STEP, SMALLEST_ASCENT_STEP, LONGEST_ASCENT_STEP, MOMENTUM = 0.3, 2e
 RESTART_INTERVAL = 20
 
 
+def peak_penalty(
+    excess: Float[np.ndarray, "*shape"],
+) -> tuple[Float[np.ndarray, "*shape"], Float[np.ndarray, "*shape"]]:
+    """Penalty of each peak beyond its limit, and its derivative.
+
+    Args:
+        excess: Logarithm of each peak over its limit.
+    """
+    quadratic = np.clip(excess, 0.0, PENALTY_WIDTH)
+    linear = np.maximum(excess - PENALTY_WIDTH, 0.0)
+    penalty = PENALTY_WEIGHT * (quadratic**2 / (2 * PENALTY_WIDTH) + linear)
+    return penalty, PENALTY_WEIGHT * quadratic / PENALTY_WIDTH
+
+
 @dataclasses.dataclass(frozen=True)
 class PenalisedEvidence:
     """The objective for one period of an input.
@@ -247,11 +263,8 @@ class InputObjective:
         u, low, high = self.voltage(x)
         result = p.evaluate(u, last, thorough)
         excess = np.log(np.maximum(p.relative_peaks(result.outputs) * self.peak_factors, 1e-12))
-        quadratic = np.clip(excess, 0.0, PENALTY_WIDTH)
-        penalty = PENALTY_WEIGHT * (
-            quadratic**2 / (2 * PENALTY_WIDTH) + np.maximum(excess - PENALTY_WIDTH, 0.0)
-        )
-        g = p.gradient(u, result, PENALTY_WEIGHT * quadratic / PENALTY_WIDTH)
+        penalty, steepness = peak_penalty(excess)
+        g = p.gradient(u, result, steepness)
         # The gradient of a sample is attributed to the samples of the period that determine it.
         by_source = (np.bincount(low, g, len(u)) + np.bincount(high, g, len(u))) / 2
         period = p.limits.voltage * by_source.reshape(SIMULATED_PERIODS, -1).sum(axis=0)

@@ -165,6 +165,9 @@ RANK_TOLERANCE = 1e-7
 RULES = Rules(
     enough=GAIN_TOLERANCE / 2, enough_share=GAIN_SHARE_TOLERANCE / 2, damping=1e-6, increase=30.0, least=1e-9
 )
+# Further starts of a fit: factors of every parameter of the rival's effect that is not an amplitude, because
+# least squares from one start finds only the local minimum of that shape.
+SHAPE_FACTORS = (0.6, 1.6)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -17,7 +17,13 @@ import numpy as np
 import scipy
 from jaxtyping import Array, Float, Int
 
-from rotflex_jax.experiment.rival_fit import MAX_STEPS, RULES, limits_of_unknowns, with_calibrations
+from rotflex_jax.experiment.rival_fit import (
+    MAX_STEPS,
+    RULES,
+    SHAPE_FACTORS,
+    limits_of_unknowns,
+    with_calibrations,
+)
 from rotflex_jax.mechanism import Mechanism, Solver, free_run, kalman_gains, linearise, predictor_run
 from rotflex_jax.mechanism.assembly import Layout, rest_state
 from rotflex_jax.mechanism.linear import output_units
@@ -30,8 +36,6 @@ from rotflex_jax.runtime.xla import double_precision
 # Prior standard deviations of the unknowns of each run: of calibrations in units of their typical size, of
 # positions and speeds in their own units. They are wide, and the same for every rival.
 CALIBRATION_SPREAD, STATE_SPREAD = 5.0, 10.0
-# Factors of the shape parameters of an effect for further starts of a fit.
-SHAPE_FACTORS = (0.6, 1.6)
 # Rows in one call of a batched program. More rows are run in turn, fewer are filled up, so that no further
 # program is compiled.
 BATCH = 16

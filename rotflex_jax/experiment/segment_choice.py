@@ -11,10 +11,12 @@ from rotflex_jax.checks import Progress
 from rotflex_jax.data import excitation
 from rotflex_jax.errors import InputError
 from rotflex_jax.experiment.discrimination import (
-    PENALTY_WEIGHT,
-    PENALTY_WIDTH,
+    FIRST_ASCENT_STEP,
+    LONGEST_ASCENT_STEP,
+    MOMENTUM,
     SMALLEST_ASCENT_STEP,
-    SMOOTH_MAXIMUM_EXPONENT,
+    peak_penalty,
+    peak_slope,
 )
 from rotflex_jax.experiment.result import Segment
 from rotflex_jax.experiment.rival_set import BATCH, Start
@@ -39,9 +41,8 @@ LEVELS = (1.0, 0.4, 0.15, 0.06)
 # Inputs whose motion has fewer standard deviations of the noise are not tried: there the rounding errors of
 # an encoder are correlated from sample to sample, and carry far less information than independent errors.
 QUIET = 20.0
-# Number of inputs that are improved by gradient ascent, evaluations of each, first step as a share of the
-# voltage limit, and share of the last direction that is kept.
-IMPROVED, LOOKS, FIRST_STEP, MOMENTUM = 4, 40, 0.3, 0.5
+# Number of inputs that are improved by gradient ascent, and evaluations of each.
+IMPROVED, LOOKS = 4, 40
 # A log-likelihood ratio with mean T has the variance 2 T; luck beyond this many deviations is disregarded.
 DEVIATIONS = 2.0
 # Largest number of reductions that bring an input within the limits on motion.
@@ -481,18 +482,10 @@ class SegmentChoice:
             own = np.zeros((H, W, C))
             for h in range(H):
                 y = details[s]["outputs"][h] - self.pose
-                size = np.maximum(np.max(np.abs(y), axis=0), 1e-300)
-                excess = np.log(np.maximum(size / bound, 1e-12))
-                quadratic = np.clip(np.where(finite, excess, 0.0), 0.0, PENALTY_WIDTH)
-                penalty = quadratic**2 / (2 * PENALTY_WIDTH) + np.where(
-                    finite, np.maximum(excess - PENALTY_WIDTH, 0.0), 0.0
-                )
-                value[s] -= PENALTY_WEIGHT * float(np.sum(penalty))
-                power = np.abs(y / size) ** (SMOOTH_MAXIMUM_EXPONENT - 1) * np.sign(y)
-                slope = power / np.sum(np.abs(y / size) ** SMOOTH_MAXIMUM_EXPONENT, axis=0) / size
-                own[h, self.before : self.before + self.M] -= (
-                    PENALTY_WEIGHT * quadratic / PENALTY_WIDTH * slope
-                )
+                excess = np.log(np.maximum(np.max(np.abs(y), axis=0) / bound, 1e-12))
+                penalty, steepness = peak_penalty(np.where(finite, excess, 0.0))
+                value[s] -= float(np.sum(penalty))
+                own[h, self.before : self.before + self.M] -= steepness * peak_slope(y)
                 for other in range(H):
                     if other == h:
                         continue
@@ -533,7 +526,7 @@ class SegmentChoice:
         """Inputs after gradient ascent, several at once; a gain lengthens the step, otherwise it is cut."""
         x = np.clip(U / self.limits.voltage, -1.0, 1.0)
         value, g = self._value_and_slope(x, n)
-        way, step = g.copy(), np.full(len(x), FIRST_STEP)
+        way, step = g.copy(), np.full(len(x), FIRST_ASCENT_STEP)
         for _ in range(LOOKS):
             size = np.sqrt(np.mean(way**2, axis=1))
             if not np.any((step > SMALLEST_ASCENT_STEP) & (size > 0)):
@@ -544,5 +537,5 @@ class SegmentChoice:
             ratio = np.linalg.norm(slope, axis=1) / np.maximum(np.linalg.norm(way, axis=1), 1e-300)
             way = np.where(better[:, None], MOMENTUM * ratio[:, None] * way + slope, way)
             x, value = np.where(better[:, None], trial, x), np.where(better, new, value)
-            step = np.where(better, np.minimum(1.6 * step, 20.0), step / 4)
+            step = np.where(better, np.minimum(1.6 * step, LONGEST_ASCENT_STEP), step / 4)
         return self.limits.voltage * x
