@@ -24,7 +24,7 @@ from rotflex_jax.experiment.rival_fit import (
     free_run_from_rest,
     rival_model,
 )
-from rotflex_jax.experiment.standard_inputs import Limits
+from rotflex_jax.experiment.standard_inputs import Limits, standard_inputs
 from rotflex_jax.models.model import Model
 from rotflex_jax.runtime.xla import double_precision
 
@@ -161,6 +161,12 @@ def test_limits_on_voltage_and_slew_hold_exactly_and_change_nothing_needlessly()
     below = np.where(k < 100, -1.0, np.minimum(1.0, -1.0 + most * (k - 99)))
     above = np.where(k < 100, np.maximum(-1.0, 1.0 - most * (100 - k)), 1.0)
     np.testing.assert_allclose(limits.playable(jump, Ts)[50:150], (below + above)[50:150] / 2, atol=1e-9)
+
+
+def test_a_tenth_of_a_second_has_all_standard_inputs():
+    """One period in 0.1 s is 10 Hz, above the highest frequency of one of the multisines and sweeps."""
+    kinds = [[s.kind for s in standard_inputs(N, 5e-4, Limits(voltage=5.0))] for N in (200, 20_000)]
+    assert kinds[0] == kinds[1] and set(kinds[0]) == {"noise", "multisine", "sweep", "prbs", "steps"}
 
 
 @pytest.mark.parametrize("before", [-1.0, -0.4, 0.0, 1.0])

@@ -8,7 +8,6 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from rotflex_jax.checks import Progress
-from rotflex_jax.data import excitation
 from rotflex_jax.errors import InputError
 from rotflex_jax.experiment.discrimination import (
     FIRST_ASCENT_STEP,
@@ -20,7 +19,7 @@ from rotflex_jax.experiment.discrimination import (
 )
 from rotflex_jax.experiment.result import Segment
 from rotflex_jax.experiment.rival_set import BATCH, Start
-from rotflex_jax.experiment.standard_inputs import MULTISINE_CREST, NOISE_CREST
+from rotflex_jax.experiment.standard_inputs import StandardInput, standard_inputs
 
 if TYPE_CHECKING:
     from rotflex_jax.experiment.sequential import SequentialExperiment
@@ -307,47 +306,36 @@ class SegmentChoice:
 
     # -- choice ------------------------------------------------------------------------------------
 
-    def _standard(self) -> list[tuple[str, str, np.ndarray]]:
-        """Standard inputs for one segment with new random numbers, and the last design.
-
-        Each is a kind, a setting and a voltage.
-        """
-        N, Ts, V, out = self.M, self.r.Ts, self.limits.voltage, []
-        seed, top = int(self.rng.integers(2**31)), 0.4 / Ts
-        low = max(0.5, 1 / (N * Ts))
-        made = []
-        for corner in (2.0, 5.0, 15.0, 40.0):
-            u = excitation.noise(N, Ts, rms=V / NOISE_CREST, bandwidth=corner, seed=seed)
-            made.append(("noise", f"{corner:g} Hz", u))
-        for high in (6.0, 12.0, 30.0, 80.0):
-            band = (low, max(2 * low, min(high, top)))
-            u = excitation.multisine(N, Ts, band=band, rms=V / MULTISINE_CREST, seed=seed)
-            made.append(("multisine", f"to {band[1]:g} Hz", u))
-            made.append(("sweep", f"to {band[1]:g} Hz", excitation.sweep(N, Ts, band=band, amplitude=V)))
-        for hold in (0.1, 0.05, 0.02, 0.01):
-            u = excitation.prbs(N, Ts, amplitude=V, hold=max(hold, Ts), seed=seed)
-            made.append(("prbs", f"held {1e3 * max(hold, Ts):g} ms", u))
-        for hold in ((0.15, 0.8), (0.05, 0.3), (0.02, 0.1)):
-            u = excitation.steps(N, Ts, amplitude=V, hold=hold, seed=seed)
-            made.append(("steps", f"held {1e3 * hold[0]:g} to {1e3 * hold[1]:g} ms", u))
-        for kind, setting, u in made:
-            out.append((kind, setting, u - u.mean()))
+    def _standard(self) -> list[StandardInput]:
+        """Standard inputs for one segment with new random numbers, and the last design."""
+        seed = int(self.rng.integers(2**31))
+        found = standard_inputs(
+            self.M,
+            self.r.Ts,
+            self.limits,
+            corners=(2.0, 5.0, 15.0, 40.0),
+            highs=(6.0, 12.0, 30.0, 80.0),
+            lowest=0.5,
+            seed=seed,
+            start=self.start,
+        )
         if self.e.history and self.e.history[-1].input == "design":
-            out.append(("design", "as the last one", self.e.runs[-1].u[-self.M :]))
-        return out
+            u = self.limits.playable(self.e.runs[-1].u[-self.M :], self.r.Ts, self.start)
+            found.append(StandardInput("design", "as the last one", u))
+        return found
 
     def best(self, say: Progress) -> tuple[Segment, str]:
         """The segment that is expected to decide soonest, and the reason if no segment would decide."""
         e, Ts = self.e, self.r.Ts
-        named = self._standard()
-        U = np.array([self.limits.playable(u, Ts, self.start) for *_, u in named])
-        U, ok = self.within_limits(U)
+        standard = self._standard()
+        U, ok = self.within_limits(np.array([s.u for s in standard]))
         if not ok.any():
             raise InputError(
                 "The machine is predicted to leave the limits on travel or deflection under the smallest "
                 "voltage, which an offset or its motion may do; widen the limits, or bring it to rest first."
             )
-        named = [(k, s, level) for level in LEVELS for (k, s, _), good in zip(named, ok, strict=True) if good]
+        possible = [s for s, good in zip(standard, ok, strict=True) if good]
+        named = [(s.kind, s.setting, level) for level in LEVELS for s in possible]
         U = np.concatenate([level * U[ok] for level in LEVELS])
         seen = self.loud(U)
         named, U = [n for n, good in zip(named, seen, strict=True) if good], U[seen]

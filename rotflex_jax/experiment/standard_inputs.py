@@ -136,34 +136,48 @@ class StandardInput:
     u: Float[np.ndarray, " N"]
 
 
-def standard_inputs(N: int, Ts: float, limits: Limits) -> list[StandardInput]:
+def standard_inputs(
+    N: int,
+    Ts: float,
+    limits: Limits,
+    *,
+    corners: tuple[float, ...] = (2.0, 5.0, 15.0),
+    highs: tuple[float, ...] = (6.0, 12.0, 30.0),
+    lowest: float = 0.1,
+    seed: int = 1,
+    start: float = 0.0,
+) -> list[StandardInput]:
     """All standard inputs at several bandwidths, as large as the limits on voltage and slew rate allow.
 
     Args:
         N: Number of samples.
         Ts: Sampling period [s].
         limits: Limits of the machine.
+        corners: Corner frequencies of noise [Hz].
+        highs: Highest frequencies of multisines and sweeps [Hz].
+        lowest: Their lowest frequency [Hz]; higher if less than one period is within N samples.
+        seed: Seed of random numbers.
+        start: Voltage of the sample before [V].
     """
-    V, top, out = limits.voltage, 0.4 / Ts, []
+    V, top, low, out = limits.voltage, 0.4 / Ts, max(lowest, 1 / (N * Ts)), []
 
     def add(kind: str, setting: str, u: np.ndarray) -> None:
         # A constant part would only make the machine drift.
-        out.append(StandardInput(kind, setting, limits.playable(u - u.mean(), Ts)))
+        out.append(StandardInput(kind, setting, limits.playable(u - u.mean(), Ts, start)))
 
-    for corner in (2.0, 5.0, 15.0):
-        add("noise", f"{corner:g} Hz", excitation.noise(N, Ts, rms=V / NOISE_CREST, bandwidth=corner, seed=1))
-    for high in (6.0, 12.0, 30.0):
-        band = (max(0.1, 1 / (N * Ts)), min(high, top))
-        add(
-            "multisine",
-            f"to {band[1]:g} Hz",
-            excitation.multisine(N, Ts, band=band, rms=V / MULTISINE_CREST, seed=1),
-        )
-        add("sweep", f"to {band[1]:g} Hz", excitation.sweep(N, Ts, band=band, amplitude=V))
+    for corner in corners:
+        u = excitation.noise(N, Ts, rms=V / NOISE_CREST, bandwidth=corner, seed=seed)
+        add("noise", f"{corner:g} Hz", u)
+    for high in highs:
+        band = (low, max(2 * low, min(high, top)))
+        setting = f"to {band[1]:g} Hz"
+        u = excitation.multisine(N, Ts, band=band, rms=V / MULTISINE_CREST, seed=seed)
+        add("multisine", setting, u)
+        add("sweep", setting, excitation.sweep(N, Ts, band=band, amplitude=V))
     for hold in (0.1, 0.05, 0.02, 0.01):
         held = max(hold, Ts)
-        add("prbs", f"held {1e3 * held:g} ms", excitation.prbs(N, Ts, amplitude=V, hold=held, seed=1))
+        add("prbs", f"held {1e3 * held:g} ms", excitation.prbs(N, Ts, amplitude=V, hold=held, seed=seed))
     for hold in ((0.15, 0.8), (0.05, 0.3), (0.02, 0.1)):
         setting = f"held {1e3 * hold[0]:g} to {1e3 * hold[1]:g} ms"
-        add("steps", setting, excitation.steps(N, Ts, amplitude=V, hold=hold, seed=1))
+        add("steps", setting, excitation.steps(N, Ts, amplitude=V, hold=hold, seed=seed))
     return out
