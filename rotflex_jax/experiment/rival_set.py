@@ -292,8 +292,15 @@ class RivalSet:
             values[..., pick] = physical[..., pick]
         return values, slope
 
-    def _seeds(self, h: int, slope: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Directions of the unknowns of one run in values and first state, filled up to a common number."""
+    def directions(
+        self, h: int, slope: Float[np.ndarray, " P"]
+    ) -> tuple[Float[np.ndarray, "D P"], Float[np.ndarray, "D n"]]:
+        """Directions of the unknowns of one run in values and first state, filled up to a common number.
+
+        Args:
+            h: Number of the rival.
+            slope: Derivative of each value with respect to its unconstrained coordinate.
+        """
         widest = max(map(len, self.free)) + self.run_unknowns
         m, o, q = len(self.free[h]), len(self.own), 2 * self.layout.n
         dvalues = np.zeros((widest, len(slope)))
@@ -307,7 +314,7 @@ class RivalSet:
         """Whitened residuals (N, C) of one run, their derivatives (N, C, A), a state and its derivatives."""
         m, o = len(self.free[h]), len(self.own)
         values, slope = self.values_and_slopes(h, x[:m], x[m : m + o])
-        dvalues, dx0 = self._seeds(h, slope)
+        dvalues, dx0 = self.directions(h, slope)
         start = self.rest.copy()
         start[: 2 * self.layout.n] = x[m + o :]
         N, (K, L, _) = len(run.u), self._filters[h]
@@ -323,7 +330,8 @@ class RivalSet:
         J = -np.einsum("kc,ncd->nkd", L, np.asarray(dy)[:N, :, :A])
         return w, J, np.asarray(state), np.asarray(dstate)[:, :A]
 
-    def _precision(self, h: int, runs: int) -> np.ndarray:
+    def prior_precision(self, h: int, runs: int) -> Float[np.ndarray, "D D"]:
+        """Precision of the prior of rival `h`: of its machine, then of the unknowns of each of some runs."""
         m, o, q = len(self.free[h]), len(self.own), 2 * self.layout.n
         own = np.concatenate([np.full(o, CALIBRATION_SPREAD**-2.0), np.full(q, STATE_SPREAD**-2.0)])
         out = np.diag(np.concatenate([np.zeros(m), np.tile(own, runs)]))
@@ -355,7 +363,7 @@ class RivalSet:
             gradient[pick] += J.T @ w.ravel()
             cost += 0.5 * float(np.sum(w**2))
             residuals.append(w)
-        precision = self._precision(h, len(runs))
+        precision = self.prior_precision(h, len(runs))
         difference = unknowns - np.concatenate([self.prior_mean[h], np.zeros(D - m)])
         known = np.isfinite(cost) and np.all(np.isfinite(information))
         if not known:

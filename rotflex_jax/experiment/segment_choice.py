@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -54,66 +54,82 @@ LEAST_SHARE = 1e-6
 LARGEST_SHIFT = 1.0
 
 
+class _Known(NamedTuple):
+    """What is known of a rival before a segment.
+
+    Attributes:
+        machine: Most probable unconstrained free parameters of the machine.
+        own: Most probable calibrations of the run.
+        state: State in which the segment begins.
+        state_slope: Its derivative by the D unknowns: those of the machine, calibrations, first positions and
+            speeds.
+        covariance: Covariance of these unknowns.
+    """
+
+    machine: Float[np.ndarray, " m"]
+    own: Float[np.ndarray, " o"]
+    state: Float[np.ndarray, " n"]
+    state_slope: Float[np.ndarray, "n D"]
+    covariance: Float[np.ndarray, "D D"]
+
+
 class SegmentChoice:
     """Chooses the next segment from the state of an experiment."""
 
     def __init__(self, e: "SequentialExperiment") -> None:
         self.e, self.r, self.limits = e, e.rivals, e.settings.limits
-        self.M, self.before = e.samples, e._before
+        self.M, self.before = e.samples, e.samples_before
         self.after = round(AFTER / self.r.Ts)
         self.p = np.maximum(e.probabilities, 1e-12)
         self.rng = np.random.default_rng([e.settings.seed, len(e.history)])
-        self._prepare()
-
-    def _prepare(self) -> None:
-        """Sets for each rival the first state and parameters of its runs, directions of errors, and draws."""
-        r, e = self.r, self.e
-        n, o, q = self.r.layout.size, len(r.own), 2 * r.layout.n
         goes_on = bool(e.runs) and e.settings.continues
         self.history = e.runs[-1].u[-self.before :] if goes_on else np.zeros(self.before)
         # The last voltage, from which the slew rate limits the next one.
         self.start = float(e.runs[-1].u[-1]) if goes_on else 0.0
-        self.pose = e.runs[-1].y[0] if goes_on else np.zeros(len(r.structure.channels))
-        values, x0, self.dvalues, self.dx0, self.information, self.nominal = [], [], [], [], [], []
-        drawn: list[list[tuple[np.ndarray, np.ndarray]]] = []
-        for h in range(r.count):
-            m, own = len(r.free[h]), np.zeros(o)
-            machine, state, prior = r.prior_mean[h], r.rest.copy(), r.prior_covariance[h]
-            spread = np.concatenate([np.zeros(m), np.ones(o + q)])
-            slope_x = np.zeros((n, m + o + q))
-            slope_x[np.arange(q), m + o + np.arange(q)] = 1.0
-            if e.runs:
-                post, D = e.posteriors[h], m + r.run_unknowns
-                machine = post.unknowns[:m]
-                last = np.concatenate([np.arange(m), len(post.unknowns) - r.run_unknowns + np.arange(o + q)])
-                cov = post.covariance(e.scale, last if goes_on else np.arange(m))
-                if goes_on:
-                    own = post.unknowns[last[m : m + o]]
-                    state, slope_x = post.state, post.state_slope
-                prior = cov
-            if not goes_on:
-                D = m + o + q
-                cov = np.zeros((D, D))
-                cov[:m, :m] = prior
-                fresh = r._precision(h, 1)[m:, m:]
-                cov[m:, m:] = np.linalg.inv(fresh)
-            v, slope = r.values_and_slopes(h, machine, own)
-            seeds, _ = r._seeds(h, slope)
-            dx = np.zeros((len(seeds), n))
-            dx[: m + o + q] = slope_x.T
+        self.pose = e.runs[-1].y[0] if goes_on else np.zeros(len(self.r.structure.channels))
+        self._prepare([self._known(h, goes_on) for h in range(self.r.count)], goes_on)
+
+    def _known(self, h: int, goes_on: bool) -> _Known:
+        """What is known of a rival, in a run that goes on or in one that is still to begin."""
+        r, e = self.r, self.e
+        m, o, q = len(r.free[h]), len(r.own), 2 * r.layout.n
+        post = e.posteriors[h] if e.runs else None
+        if post is not None and goes_on:
+            run = len(post.unknowns) - r.run_unknowns + np.arange(o + q)
+            covariance = post.covariance(e.scale, np.concatenate([np.arange(m), run]))
+            return _Known(post.unknowns[:m], post.unknowns[run[:o]], post.state, post.state_slope, covariance)
+        covariance = np.zeros((m + o + q, m + o + q))
+        covariance[:m, :m] = r.prior_covariance[h] if post is None else post.covariance(e.scale, np.arange(m))
+        covariance[m:, m:] = np.linalg.inv(r.prior_precision(h, 1)[m:, m:])
+        slope = np.zeros((r.layout.size, m + o + q))
+        slope[np.arange(q), m + o + np.arange(q)] = 1.0
+        machine = r.prior_mean[h] if post is None else post.unknowns[:m]
+        return _Known(machine, np.zeros(o), r.rest.copy(), slope, covariance)
+
+    def _prepare(self, known: Sequence[_Known], goes_on: bool) -> None:
+        """Sets for each rival the first state and parameters of its runs, directions of errors, and draws."""
+        values, self.dvalues, self.dx0, self.information = [], [], [], []
+        self.drawn: list[list[tuple[np.ndarray, np.ndarray]]] = []
+        for h, k in enumerate(known):
+            D, m = len(k.covariance), len(k.machine)
+            v, slope = self.r.values_and_slopes(h, k.machine, k.own)
+            dvalues, _ = self.r.directions(h, slope)
+            dx = np.zeros((len(dvalues), len(k.state)))
+            dx[:D] = k.state_slope.T
             values.append(v)
-            x0.append(state)
-            self.nominal.append((machine, own))
-            self.dvalues.append(seeds)
+            self.dvalues.append(dvalues)
             self.dx0.append(dx)
-            self.information.append(np.linalg.inv(cov + 1e-12 * np.diag(np.diag(cov))))
+            self.information.append(np.linalg.inv(k.covariance + 1e-12 * np.diag(np.diag(k.covariance))))
             # A run that is still to begin starts at rest: only the machine is drawn.
-            loose = cov if goes_on else cov * np.outer(1 - spread, 1 - spread)
-            w, V = np.linalg.eigh((loose + loose.T) / 2)
+            drawn = np.ones(D) if goes_on else (np.arange(D) < m).astype(float)
+            spread = k.covariance * np.outer(drawn, drawn)
+            w, V = np.linalg.eigh((spread + spread.T) / 2)
             steps = (V * np.sqrt(np.maximum(w, 0))) @ self.rng.standard_normal((len(w), DRAWS))
-            drawn.append([(self._likely(v, seeds[: len(d)].T @ d), state + slope_x @ d) for d in steps.T])
-        self.values, self.x0, self.drawn = np.array(values), np.array(x0), drawn
-        self.machine_own = [len(r.free[h]) + o + q for h in range(r.count)]
+            self.drawn.append(
+                [(self._likely(v, dvalues[:D].T @ d), k.state + k.state_slope @ d) for d in steps.T]
+            )
+        self.values, self.x0 = np.array(values), np.array([k.state for k in known])
+        self.nominal = [(k.machine, k.own) for k in known]
 
     def _likely(self, values: np.ndarray, change: np.ndarray) -> np.ndarray:
         """Values of a draw: physical values after a change, at some distance from their bounds.
@@ -228,7 +244,7 @@ class SegmentChoice:
         amounts = [(C * min(self.M, math.ceil(n * self.M - 1e-9)), max(n, 1.0)) for n in repeats]
         for b in range(B):
             for other in range(H):
-                D = self.machine_own[other]
+                D = len(self.information[other])
                 A = r.whitened(other, np.moveaxis(J[b, other, ..., :D], -1, 0)) / root
                 A = A.reshape(D, -1).T
                 G = {m: A[:m].T @ A[:m] for m, _ in amounts}
@@ -423,14 +439,13 @@ class SegmentChoice:
         The reason holds if, whichever rival is true, some other rival stays possible even with the best
         input, the most favourable parameters and favourable noise.
         """
-        p, error, H = self.p, self.e.settings.error, self.r.count
-        alive = [h for h in range(H) if p[h] > error / (10 * H)]
+        p, H, needed = self.p, self.r.count, self.needed
+        alive = [h for h in range(H) if p[h] > self.e.settings.error / (10 * H)]
         reached = np.maximum(T.max(axis=(0, 2)), 0.0)
         stuck = {}
         for h in alive:
-            needs = math.log((1 - error) / error) - np.log(p[h] / p)
             lucky = reached[h] + DEVIATIONS * np.sqrt(2 * reached[h])
-            others = [r for r in alive if r != h and lucky[r] < needs[r]]
+            others = [r for r in alive if r != h and lucky[r] < needed[h, r]]
             if not others:
                 return ""
             stuck[h] = max(others, key=lambda r: p[r])
@@ -440,11 +455,11 @@ class SegmentChoice:
         r = stuck[h]
         names, s = self.r.labels, self.e.settings
         gain = max(float(reached[h, r]), float(reached[r, h]))
-        need = max(0.0, math.log((1 - error) / error) - math.log(p[h] / p[r]))
         return (
             f"No experiment within these limits distinguishes {names[h]} from {names[r]}: after "
             f"{self.e.seconds:g} s on the rig the best of {tried} inputs ({', '.join(best)}) would bring at "
-            f"most {gain:.2g} nats in the {left * s.segment_seconds:.3g} s that are left, and {need:.2g} are "
+            f"most {gain:.2g} nats in the {left * s.segment_seconds:.3g} s that are left, and "
+            f"{max(0.0, float(needed[h, r])):.2g} are "
             "needed."
         )
 

@@ -128,13 +128,14 @@ class SequentialExperiment:
         return sum(len(r.u) for r in self.runs) * self.rivals.Ts
 
     @property
-    def _before(self) -> int:
+    def samples_before(self) -> int:
+        """Number of samples before a segment with which its simulation begins."""
         return round(BEFORE / self.rivals.Ts)
 
     @functools.cached_property
     def posteriors(self) -> tuple[RivalPosterior, ...]:
         """Posterior of each rival after all recordings."""
-        place = max(0, len(self.runs[-1].u) - self._before)
+        place = max(0, len(self.runs[-1].u) - self.samples_before)
         return tuple(
             self.rivals.posterior(h, x, self.runs, place, self.samples) for h, x in enumerate(self.unknowns)
         )
@@ -320,7 +321,7 @@ class SequentialExperiment:
             last = runs[-1]
             whole = RunData(np.concatenate([last.u, run.u]), np.concatenate([last.y, run.y]))
             runs = (*runs[:-1], whole)
-        place, unknowns = max(0, len(runs[-1].u) - self._before), []
+        place, unknowns = max(0, len(runs[-1].u) - self.samples_before), []
         earlier = self.history if first else self.history[:-1]
         for h in range(r.count):
             start = np.concatenate([self.unknowns[h] if self.unknowns else r.prior_mean[h], *own])
