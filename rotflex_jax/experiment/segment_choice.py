@@ -73,6 +73,19 @@ class _Known(NamedTuple):
     covariance: Float[np.ndarray, "D D"]
 
 
+class _Named(NamedTuple):
+    """Kind and setting of an input, and its level as a share of what the limits allow."""
+
+    kind: str
+    setting: str
+    level: float
+
+    @property
+    def words(self) -> str:
+        """The setting with the level."""
+        return self.setting + (f", x {self.level:g}" if self.level != 1 else "")
+
+
 class SegmentChoice:
     """Chooses the next segment from the state of an experiment."""
 
@@ -342,7 +355,50 @@ class SegmentChoice:
 
     def best(self, say: Progress) -> tuple[Segment, str]:
         """The segment that is expected to decide soonest, and the reason if no segment would decide."""
-        e, Ts = self.e, self.r.Ts
+        settings = self.e.settings
+        named, U = self._possible()
+        left = max(1.0, (settings.max_seconds - self.e.seconds) / settings.segment_seconds)
+        repeats = self._amounts(left)
+        T, _ = self.evidence(U, repeats, drawn=True)
+        order, seconds, worth = self._rated(T, repeats)
+        if settings.improve:
+            n = float(
+                np.clip(seconds[order[0]] / settings.segment_seconds, repeats[0], min(LOOK_AHEAD, left))
+            )
+            more, designs = self._designs(named, U, order, n, say)
+            if more:
+                new, _ = self.evidence(designs, repeats, drawn=True)
+                named, U, T = named + more, np.concatenate([U, designs]), np.concatenate([T, new], axis=1)
+                order, _, worth = self._rated(T, repeats)
+        top, ahead = order[0], self._ahead(repeats)
+        worst = np.maximum(T[ahead, top].min(axis=1), 0.0)
+        segment = Segment(
+            rivals=self.r.labels,
+            u=U[top],
+            Ts=self.r.Ts,
+            input=named[top].kind,
+            setting=named[top].words,
+            nats=worst,
+            expected_error=float(min(1.0 - self.e.probabilities.max(), math.exp(self.bound(worst)))),
+            probabilities=tuple(self.e.probabilities.tolist()),
+            repeats=repeats[ahead],
+            peaks=dict(zip(self.r.structure.channels, self.peaks(U[top : top + 1])[0].tolist(), strict=True)),
+            table=tuple((named[i].kind, named[i].words, float(worth[i])) for i in order[:LISTED]),
+            tried=len(U),
+            limits=self.limits,
+            outputs=self.outputs(U[top : top + 1])[0, :, 0, : self.M],
+            channels=self.r.structure.channels,
+            units=self.r.units,
+            input_unit=self.r.structure.units.input,
+        )
+        return segment, self._too_small(T[-1], left, named[top])
+
+    def _possible(self) -> tuple[list[_Named], np.ndarray]:
+        """Standard inputs at several levels that keep the limits and move the machine enough.
+
+        Raises:
+            InputError: If no input keeps the limits.
+        """
         standard = self._standard()
         U, ok = self.within_limits(np.array([s.u for s in standard]))
         if not ok.any():
@@ -351,59 +407,22 @@ class SegmentChoice:
                 "voltage, which an offset or its motion may do; widen the limits, or bring it to rest first."
             )
         possible = [s for s, good in zip(standard, ok, strict=True) if good]
-        named = [(s.kind, s.setting, level) for level in LEVELS for s in possible]
+        named = [_Named(s.kind, s.setting, level) for level in LEVELS for s in possible]
         U = np.concatenate([level * U[ok] for level in LEVELS])
         seen = self.loud(U)
-        named, U = [n for n, good in zip(named, seen, strict=True) if good], U[seen]
-        left = max(1.0, (e.settings.max_seconds - e.seconds) / e.settings.segment_seconds)
-        repeats = self._amounts(left)
-        T, _ = self.evidence(U, repeats, drawn=True)
-        seconds, worth = self._rated(T, repeats)
-        order = np.lexsort((-worth, seconds))
-        tried = len(U)
-        if e.settings.improve:
-            starts = self._distinct(order, named)
-            say(f"improving {len(starts)} inputs")
-            n = seconds[order[0]] / e.settings.segment_seconds
-            n = float(np.clip(n, repeats[0], min(LOOK_AHEAD, left)))
-            designs = self._improved(U[starts], n)
-            designs, ok = self.within_limits(
-                np.array([self.limits.playable(u, Ts, self.start) for u in designs])
-            )
-            ok &= self.loud(designs)
-            if ok.any():
-                new, _ = self.evidence(designs[ok], repeats, drawn=True)
-                T, U = np.concatenate([T, new], axis=1), np.concatenate([U, designs[ok]])
-                from_ = [named[i] for i, good in zip(starts, ok, strict=True) if good]
-                named += [("design", f"from {k}, {s}", 1.0) for k, s, _ in from_]
-                tried = len(U)
-        seconds, worth = self._rated(T, repeats)
-        order = np.lexsort((-worth, seconds))
-        top = order[0]
-        peaks = self.peaks(U[top : top + 1])[0]
-        label = lambda i: (named[i][0], named[i][1] + (f", x {named[i][2]:g}" if named[i][2] != 1 else ""))  # noqa: E731
-        ahead = self._ahead(repeats)
-        worst = np.maximum(T[ahead, top].min(axis=1), 0.0)
-        segment = Segment(
-            rivals=self.r.labels,
-            u=U[top],
-            Ts=Ts,
-            input=label(top)[0],
-            setting=label(top)[1],
-            nats=worst,
-            expected_error=float(min(1.0 - e.probabilities.max(), math.exp(self.bound(worst)))),
-            probabilities=tuple(e.probabilities.tolist()),
-            repeats=repeats[ahead],
-            peaks=dict(zip(self.r.structure.channels, peaks.tolist(), strict=True)),
-            table=tuple((*label(i), float(worth[i])) for i in order[:LISTED]),
-            tried=tried,
-            limits=self.limits,
-            outputs=self.outputs(U[top : top + 1])[0, :, 0, : self.M],
-            channels=self.r.structure.channels,
-            units=self.r.units,
-            input_unit=self.r.structure.units.input,
-        )
-        return segment, self._too_small(T[-1], left, tried, label(int(order[0])))
+        return [n for n, good in zip(named, seen, strict=True) if good], U[seen]
+
+    def _designs(
+        self, named: list[_Named], U: np.ndarray, order: np.ndarray, n: float, say: Progress
+    ) -> tuple[list[_Named], np.ndarray]:
+        """The best inputs, improved by gradient for `n` repetitions; those that keep the limits."""
+        starts = self._distinct(order, named)
+        say(f"improving {len(starts)} inputs")
+        improved = [self.limits.playable(u, self.r.Ts, self.start) for u in self._improved(U[starts], n)]
+        designs, ok = self.within_limits(np.array(improved))
+        ok &= self.loud(designs)
+        begun = [named[i] for i, good in zip(starts, ok, strict=True) if good]
+        return [_Named("design", f"from {b.kind}, {b.setting}", 1.0) for b in begun], designs[ok]
 
     def _amounts(self, left: float) -> tuple[float, ...]:
         """Numbers of repetitions at which inputs are rated: pieces of the first, then up to the time left."""
@@ -417,23 +436,21 @@ class SegmentChoice:
         """Index of the number of repetitions at which the worth of an input is computed."""
         return repeats.index(min(LOOK_AHEAD, repeats[-1]))
 
-    def _rated(self, T: np.ndarray, repeats: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
-        """Expected time until a decision [s] and worth [nat] of each input, for the worst of the draws."""
+    def _rated(self, T: np.ndarray, repeats: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Order of the inputs, expected seconds and worth [nat] of each, for the worst of the draws."""
         worst = T.min(axis=3)
-        return self.seconds_until_decided(worst, repeats), self.usefulness(worst[self._ahead(repeats)])
+        seconds = self.seconds_until_decided(worst, repeats)
+        worth = self.usefulness(worst[self._ahead(repeats)])
+        return np.lexsort((-worth, seconds)), seconds, worth
 
-    def _distinct(self, order: np.ndarray, named: list[Any]) -> list[int]:
+    def _distinct(self, order: np.ndarray, named: list[_Named]) -> list[int]:
         """Indices of the best input of each of the best kinds and settings."""
-        chosen, kinds = [], set()
+        best: dict[tuple[str, str], int] = {}
         for i in order:
-            if named[i][:2] not in kinds:
-                kinds.add(named[i][:2])
-                chosen.append(int(i))
-            if len(chosen) == IMPROVED:
-                break
-        return chosen
+            best.setdefault((named[i].kind, named[i].setting), int(i))
+        return list(best.values())[:IMPROVED]
 
-    def _too_small(self, T: np.ndarray, left: float, tried: int, best: tuple[str, str]) -> str:
+    def _too_small(self, T: np.ndarray, left: float, best: _Named) -> str:
         """Reason why no input would decide in the time that is left; empty if one may.
 
         The reason holds if, whichever rival is true, some other rival stays possible even with the best
@@ -457,10 +474,9 @@ class SegmentChoice:
         gain = max(float(reached[h, r]), float(reached[r, h]))
         return (
             f"No experiment within these limits distinguishes {names[h]} from {names[r]}: after "
-            f"{self.e.seconds:g} s on the rig the best of {tried} inputs ({', '.join(best)}) would bring at "
-            f"most {gain:.2g} nats in the {left * s.segment_seconds:.3g} s that are left, and "
-            f"{max(0.0, float(needed[h, r])):.2g} are "
-            "needed."
+            f"{self.e.seconds:g} s on the rig the best of {len(T)} inputs ({best.kind}, {best.words}) "
+            f"would bring at most {gain:.2g} nats in the {left * s.segment_seconds:.3g} s that are left, and "
+            f"{max(0.0, float(needed[h, r])):.2g} are needed."
         )
 
     # -- improvement by gradient -------------------------------------------------------------------
