@@ -149,25 +149,12 @@ def next_experiment(
     """
     say = checks.progress(progress)
     if a is None and b is None and not isinstance(model, Fit | Model | Mechanism):
-        sample_counts(seconds, Ts)
         if reference is not None:
             raise InputError(
                 "Argument `reference` is for two effects of one model, but several models were given, which "
                 "have their parameters; leave it out."
             )
-        models, found = models_of(model, say)
-        several = sequential_experiment(
-            models,
-            limits,
-            Ts,
-            probabilities=found if probabilities is None else probabilities,
-            max_seconds=seconds,
-            segment_seconds=seconds,
-            noise=noise,
-            process_noise=process_noise,
-            improve=improve,
-        )
-        return SegmentChoice(several).best(say)[0]
+        return _next_segment(model, limits, seconds, Ts, noise, process_noise, improve, probabilities, say)
     if a is None or b is None:
         raise InputError(
             "Two effects must be named where one model is given, such as 'delay@input' and 'lag@input'; or "
@@ -189,25 +176,12 @@ def next_experiment(
     say("fitting each effect to the other")
     pair = _rival_pair(fitted, a, b, process_noise, sd, Ts, reference, limits)
     problem = DiscriminationProblem(pair, Ts, limits, _parameter_variations(model, pair[0]))
-    ranked = []
-    offered = standard_inputs(N, Ts, limits)
-    for k, s in enumerate(offered):
-        say(f"ranking standard inputs: {k + 1} of {len(offered)}")
-        ranked.append(_rate_input(problem, s))
-    problem = problem.without_nested_direction([result for *_, result in ranked])
-    ranked = [_count_directions(problem, *row) for row in ranked]
-    ranked.sort(key=_evidence, reverse=True)
-    for rated, u, _ in ranked[:2]:
-        for share in REDUCED_AMPLITUDES:
-            reduced = StandardInput(rated.input, f"{rated.setting}, x {share:g}", share * u)
-            ranked.append(_rate_input(problem, reduced))
-    ranked.sort(key=_evidence, reverse=True)
-    count = max(1, round(N / P))
+    problem, ranked = _ranked_inputs(problem, N, say)
     designs = []
     for k, (rated, u, _) in enumerate(ranked[:starts] if improve else []):
         say(f"improving {rated.input}, {rated.setting} ({k + 1} of {starts})")
         period = optimise_input(problem, u[:P], looks, say)
-        whole = limits.playable(np.tile(period, count + 1)[:N], Ts)
+        whole = limits.playable(np.tile(period, max(1, round(N / P)) + 1)[:N], Ts)
         design = StandardInput("design", f"from {rated.input}, {rated.setting}", whole)
         designs.append(_rate_input(problem, design, thorough=True))
     table = sorted([*designs, *ranked], key=_evidence, reverse=True)
@@ -233,6 +207,60 @@ def next_experiment(
     )
 
 
+def _next_segment(
+    models: Any,
+    limits: Limits,
+    seconds: float,
+    Ts: float,
+    noise: Mapping[str, float] | None,
+    process_noise: Mapping[str, float] | None,
+    improve: bool,
+    probabilities: Any,
+    say: Progress,
+) -> Segment:
+    """The input that distinguishes several models; arguments as in `next_experiment`."""
+    sample_counts(seconds, Ts)
+    models, found = models_of(models, say)
+    several = sequential_experiment(
+        models,
+        limits,
+        Ts,
+        probabilities=found if probabilities is None else probabilities,
+        max_seconds=seconds,
+        segment_seconds=seconds,
+        noise=noise,
+        process_noise=process_noise,
+        improve=improve,
+    )
+    return SegmentChoice(several).best(say)[0]
+
+
+# Rating, voltage and result of an input, as they are ranked.
+_RatedInput = tuple[Rated, np.ndarray, Discrimination]
+
+
+def _ranked_inputs(
+    problem: DiscriminationProblem, N: int, say: Progress
+) -> tuple[DiscriminationProblem, list[_RatedInput]]:
+    """Standard inputs of N samples, best first, and the problem with the directions that count.
+
+    The best two are rated at smaller amplitudes too.
+    """
+    offered, rated_inputs = standard_inputs(N, problem.Ts, problem.limits), []
+    for k, s in enumerate(offered):
+        say(f"ranking standard inputs: {k + 1} of {len(offered)}")
+        rated_inputs.append(_rate_input(problem, s))
+    problem = problem.without_nested_direction([result for *_, result in rated_inputs])
+    ranked = [_count_directions(problem, *row) for row in rated_inputs]
+    ranked.sort(key=_evidence, reverse=True)
+    for rated, u, _ in ranked[:2]:
+        for share in REDUCED_AMPLITUDES:
+            reduced = StandardInput(rated.input, f"{rated.setting}, x {share:g}", share * u)
+            ranked.append(_rate_input(problem, reduced))
+    ranked.sort(key=_evidence, reverse=True)
+    return problem, ranked
+
+
 def _notes(model: Fit | Model | Mechanism, chosen: Rated) -> tuple[str, ...]:
     """Reasons to doubt the expected evidence."""
     notes = []
@@ -251,10 +279,6 @@ def _notes(model: Fit | Model | Mechanism, chosen: Rated) -> tuple[str, ...]:
             f"{ENOUGH:.2g} make one of them 99 % probable."
         )
     return tuple(notes)
-
-
-# Rating, voltage and result of an input, as they are ranked.
-_RatedInput = tuple[Rated, np.ndarray, Discrimination]
 
 
 def _evidence(row: _RatedInput) -> float:
