@@ -56,36 +56,10 @@ def rival_set(
         check_input_alone(m.mechanism, "a designed experiment")
     reduced = [m.without_gates() for m in models]
     labels = _labels([name for name, _ in items], reduced)
-    first = reduced[0].mechanism
-    for label, m in zip(labels, reduced, strict=True):
-        other = m.mechanism
-        same = (
-            other.coordinates == first.coordinates
-            and dict(other.ports) == dict(first.ports)
-            and other.outputs == first.outputs
-            and other.units == first.units
-            and m.solver == reduced[0].solver
-        )
-        if not same:
-            raise InputError(
-                f"{labels[0]!r} and {label!r} differ in coordinates, ports, outputs or solver, but models of "
-                "one machine may differ in effects only; build them from the same mechanism."
-            )
-    effects: dict[tuple[str, str], Effect] = {}
-    complete = [with_calibrations(m.mechanism) for m in reduced]
-    for m in complete:
-        for e in m.effects:
-            known = effects.setdefault((e.name, e.at), e)
-            if (
-                type(known) is not type(e)
-                or set(known.values) != set(e.values)
-                or e.replace(**known.values) != known
-            ):
-                raise InputError(
-                    f"The effect {e.name}@{e.at} has another form in one model than in another, but one "
-                    "structure must serve all; give it the same settings."
-                )
-    union = dataclasses.replace(first, effects=tuple(effects.values()), trusted=frozenset())
+    _check_one_machine(labels, reduced)
+    first, complete = reduced[0].mechanism, [with_calibrations(m.mechanism) for m in reduced]
+    effects = _all_effects(complete)
+    union = dataclasses.replace(first, effects=effects, trusted=frozenset())
     names, specs = union.parameter_names, union.parameter_specifications
     transform = Transform.of(specs)
     before = {n for m in reduced for n in m.mechanism.parameter_names}
@@ -123,6 +97,43 @@ def rival_set(
         process_noise_of(first, process_noise),
         float(Ts),
     )
+
+
+def _check_one_machine(labels: Sequence[str], models: Sequence[Model]) -> None:
+    """Refuse models that differ in more than effects."""
+    first = models[0].mechanism
+    for label, m in zip(labels, models, strict=True):
+        other = m.mechanism
+        same = (
+            other.coordinates == first.coordinates
+            and dict(other.ports) == dict(first.ports)
+            and other.outputs == first.outputs
+            and other.units == first.units
+            and m.solver == models[0].solver
+        )
+        if not same:
+            raise InputError(
+                f"{labels[0]!r} and {label!r} differ in coordinates, ports, outputs or solver, but models of "
+                "one machine may differ in effects only; build them from the same mechanism."
+            )
+
+
+def _all_effects(mechanisms: Sequence[Mechanism]) -> tuple[Effect, ...]:
+    """The effects of all mechanisms, each once; refuse effects that differ in more than parameter values."""
+    effects: dict[tuple[str, str], Effect] = {}
+    for m in mechanisms:
+        for e in m.effects:
+            known = effects.setdefault((e.name, e.at), e)
+            if (
+                type(known) is not type(e)
+                or set(known.values) != set(e.values)
+                or e.replace(**known.values) != known
+            ):
+                raise InputError(
+                    f"The effect {e.name}@{e.at} has another form in one model than in another, but one "
+                    "structure must serve all; give it the same settings."
+                )
+    return tuple(effects.values())
 
 
 def _switching_solver(models: Sequence[Model], union: Mechanism) -> Solver:
