@@ -1,6 +1,6 @@
 """Evaluation of fitted models: errors of free runs, with and without own offsets of each run, and estimates.
 
-No choice of effects depends on this module.
+The rounds of a search do not depend on this module; the final fit compares structures by its errors.
 """
 
 import dataclasses
@@ -11,7 +11,12 @@ import numpy as np
 from jaxtyping import Float
 
 from rotflex_jax.discover.hypothesis import Hypothesis, with_all_calibrations
-from rotflex_jax.discover.likelihood import BLOCK_SECONDS, LikelihoodProblem, refit
+from rotflex_jax.discover.likelihood import (
+    BLOCK_SECONDS,
+    LikelihoodProblem,
+    process_noise_gain,
+    refit,
+)
 from rotflex_jax.discover.result import KnownRuns, RunErrors, Stage
 from rotflex_jax.discover.supermodel import EffectLocation, SuperModel
 from rotflex_jax.discover.validation import (
@@ -39,7 +44,7 @@ from rotflex_jax.runtime.persistent_jit import make_ahead
 SAME_SIZE = 0.25
 # Largest number of fits of the offsets of a recording; each uses the size of the errors that the last one
 # left.
-CALIBRATIONS = 8
+MOST_OFFSET_FITS = 8
 
 
 def calibrate(problem: LikelihoodProblem, h: Hypothesis, seconds: float) -> Hypothesis:
@@ -62,7 +67,7 @@ def calibrate(problem: LikelihoodProblem, h: Hypothesis, seconds: float) -> Hypo
     prior = BLOCK_SECONDS / np.asarray(problem.dataset.data.Ts)
     own = start
     # Errors caused by an offset do not measure how well it is determined: the size of errors is updated.
-    for _ in range(CALIBRATIONS):
+    for _ in range(MOST_OFFSET_FITS):
         own = early.with_likelihood(own)
         if not np.isfinite(own.log_likelihood):
             return start
@@ -229,18 +234,6 @@ def evaluate(
         friction_of_runs={names[i]: tuple(values[:, i].tolist()) for i in h.sizes},
         friction_of_validation=of_validation,
     )
-
-
-def process_noise_gain(problem: LikelihoodProblem, h: Hypothesis) -> float:
-    """Log-likelihood per measured value that process noise gains over a free run [nat].
-
-    Both have the same parameters. The free run has the least process noise, which is relative to the fitted
-    torque of the motor, so the values given by the user do not matter.
-    """
-    least = dict.fromkeys(problem.ports, problem.least_process_noise(h))
-    free_run = problem.with_process_noise(h, least)
-    with_noise, without = problem.log_likelihoods([h, free_run])
-    return (with_noise - without) / problem.measured_values
 
 
 def estimates(problem: LikelihoodProblem, h: Hypothesis) -> tuple[Estimate, ...]:

@@ -447,6 +447,18 @@ def choose_process_noise(problem: LikelihoodProblem, h: Hypothesis, wide: bool =
     return best
 
 
+def process_noise_gain(problem: LikelihoodProblem, h: Hypothesis) -> float:
+    """Log-likelihood per measured value that process noise gains over a free run [nat].
+
+    Both have the same parameters. The free run has the least process noise, which is relative to the fitted
+    torque of the motor, so the values given by the user do not matter.
+    """
+    least = dict.fromkeys(problem.ports, problem.least_process_noise(h))
+    free_run = problem.with_process_noise(h, least)
+    with_noise, without = problem.log_likelihoods([h, free_run])
+    return (with_noise - without) / problem.measured_values
+
+
 def refit(
     problem: LikelihoodProblem, hypotheses: Sequence[Hypothesis], wide: bool = False, alternations: int = 3
 ) -> list[Hypothesis]:

@@ -17,14 +17,13 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from jaxtyping import Float
 
-from rotflex_jax.discover.evaluation import process_noise_gain
 from rotflex_jax.discover.hypothesis import (
     CandidateStart,
     Hypothesis,
     parameter_count,
     with_candidate,
 )
-from rotflex_jax.discover.likelihood import LikelihoodProblem, refit
+from rotflex_jax.discover.likelihood import LikelihoodProblem, process_noise_gain, refit
 from rotflex_jax.discover.score_test import PairScore, PairStart, ScoreTest
 from rotflex_jax.discover.selection import (
     TRAIN_NATS,

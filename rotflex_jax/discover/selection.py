@@ -346,8 +346,7 @@ def undecided(found: ValidatedHypothesis, rival: ValidatedHypothesis, left: floa
     """
     if _contained(found, rival) and not (_is_worth(rival, found, measured) or _leads(rival, found)):
         return False
-    lost = paired_gain(found.blocks, rival.blocks)[0] + _training_gain(found, rival)[0]
-    if predictions_apart(found, rival) and lost > left:
+    if predictions_apart(found, rival) and _prediction_gain(found, rival) > left:
         return False
     return _free_run_certainty(found, rival) < FREE_RUN_Z or log_best_ratio(rival, found) < LAWS_APART
 

@@ -17,12 +17,15 @@ from rotflex_jax.discover.evaluation import (
     evaluate,
     own_estimates,
     paired_estimates,
-    process_noise_gain,
 )
 from rotflex_jax.discover.final_fit import Refused, fit_to_all
 from rotflex_jax.discover.friction_of_runs import own_friction_notes
 from rotflex_jax.discover.hypothesis import Hypothesis
-from rotflex_jax.discover.likelihood import choose_process_noise, finer_integration
+from rotflex_jax.discover.likelihood import (
+    choose_process_noise,
+    finer_integration,
+    process_noise_gain,
+)
 from rotflex_jax.discover.localise import locate_in_windows
 from rotflex_jax.discover.probabilities import Probabilities, fitted_sets, probabilities
 from rotflex_jax.discover.result import (
