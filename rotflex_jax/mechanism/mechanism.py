@@ -23,7 +23,7 @@ from rotflex_jax.text.markup import card, paragraph, table
 from rotflex_jax.text.numbers import equation, unit_text
 
 
-def ports(given: Any) -> tuple[tuple[str, tuple[float, ...]], ...]:
+def checked_ports(given: Any) -> tuple[tuple[str, tuple[float, ...]], ...]:
     """The ports as pairs of name and vector, checked."""
     try:
         found = tuple((str(name), tuple(float(c) for c in vector)) for name, vector in dict(given).items())
@@ -37,7 +37,7 @@ def ports(given: Any) -> tuple[tuple[str, tuple[float, ...]], ...]:
         ) from None
 
 
-def outputs(given: Any) -> tuple[tuple[str, tuple[str, str]], ...]:
+def checked_outputs(given: Any) -> tuple[tuple[str, tuple[str, str]], ...]:
     """The outputs as pairs of channel and (port, measured quantity), checked."""
     if not isinstance(given, (Mapping, tuple)) or (given and isinstance(given, tuple) and len(given[0]) != 2):
         raise InputError(
@@ -57,7 +57,7 @@ def outputs(given: Any) -> tuple[tuple[str, tuple[str, str]], ...]:
     return tuple((k, (v[0], v[1])) for k, v in each.items() if v is not None)
 
 
-def effects(given: Any) -> tuple[Effect, ...]:
+def checked_effects(given: Any) -> tuple[Effect, ...]:
     """The effects as a tuple, in their order, checked."""
     sequence = checks.entries(given)
     if sequence is None and not isinstance(given, Effect | type):
@@ -94,7 +94,7 @@ def process_noise_of(mechanism: "Mechanism", given: Any) -> dict[str, float]:
     return found
 
 
-def check(mechanism: "Mechanism") -> None:
+def check_parts(mechanism: "Mechanism") -> None:
     """Raise `InputError` where ports, outputs and effects do not fit together."""
     if not mechanism.coordinates:
         raise InputError(
@@ -227,13 +227,13 @@ class Mechanism:
     def __post_init__(self) -> None:
         put = lambda name, value: object.__setattr__(self, name, value)  # noqa: E731 - frozen class
         put("coordinates", checks.names(self.coordinates, "coordinates"))
-        put("ports", ports(self.ports))
-        put("effects", effects(self.effects))
-        put("outputs", outputs(self.outputs))
+        put("ports", checked_ports(self.ports))
+        put("effects", checked_effects(self.effects))
+        put("outputs", checked_outputs(self.outputs))
         put("trusted", frozenset(checks.names(self.trusted, "trusted")))
         known = (*checks.names(self.signals, "signals"), *(e.signal for e in self.effects if e.signal))
         put("signals", tuple(dict.fromkeys(known)))
-        check(self)
+        check_parts(self)
         put("trusted", self.trusted | set(self.followers))  # a fit moves the parameters that these follow
         for name in sorted(self.trusted):
             self._must_exist(name)
@@ -449,22 +449,21 @@ class Mechanism:
         listed: Any = values.tolist() if isinstance(values, np.ndarray) else values
         if isinstance(values, jax.Array):  # all at once, which traces many times faster than one by one
             listed = jnp.unstack(values)
+        return self._with_numbers(listed, self.trusted)
+
+    def _with_numbers(self, numbers: Sequence[Any], trusted: frozenset[str]) -> "Mechanism":
+        """The same mechanism with other numbers in its effects, without the checks of a new mechanism."""
         effects, start = [], 0
         for e in self.effects:
-            names = tuple(e.values)
-            part = {n: listed[start + i] for i, n in enumerate(names)}
+            part = {n: numbers[start + i] for i, n in enumerate(e.values)}
             effects.append(e.replace(**part))
-            start += len(names)
-        return self._with_numbers(tuple(effects), self.trusted)
-
-    def _with_numbers(self, effects: tuple[Effect, ...], trusted: frozenset[str]) -> "Mechanism":
-        """The same mechanism with other numbers in its effects, without the checks of a new mechanism."""
+            start += len(part)
         rebuilt = object.__new__(type(self))
         # Cached properties that depend on the structure alone are taken over.
         known = ("structure", "parameter_names", "followers", "parameter_specifications")
         rebuilt.__dict__.update({name: self.__dict__[name] for name in known if name in self.__dict__})
         fields = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
-        rebuilt.__dict__.update(fields | {"effects": effects, "trusted": trusted})
+        rebuilt.__dict__.update(fields | {"effects": tuple(effects), "trusted": trusted})
         return rebuilt
 
     def trust(self, *names: str) -> "Mechanism":
@@ -496,12 +495,7 @@ class Mechanism:
     def tree_unflatten(cls, aux: Any, leaves: Sequence[Any]) -> "Mechanism":
         """The mechanism with these leaves (numbers or tracers)."""
         structure, trusted = aux
-        effects, start = [], 0
-        for e in structure.effects:
-            part = {n: leaves[start + i] for i, n in enumerate(e.values)}
-            effects.append(e.replace(**part))
-            start += len(part)
-        return structure._with_numbers(tuple(effects), trusted)
+        return structure._with_numbers(leaves, trusted)
 
     def _status(self, name: str) -> str:
         if name in self.followers:
