@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from rotflex_jax import checks
 from rotflex_jax.errors import InputError
+from rotflex_jax.fit.coordinates import FitCoordinates
 from rotflex_jax.fit.dataset import padded_length, prepare
 from rotflex_jax.fit.discretisation_bias import coarse_step, finer_steps
 from rotflex_jax.fit.greybox_problem import LEAST_SCALE, FitAttempt, FitPoint, FitStage, GreyBoxProblem
@@ -59,7 +60,6 @@ def report(
     """
     model, data, point, windows = problem.model, problem.dataset.data, end.point, end.stage.windows
     m, coordinates, seen = model.mechanism, problem.coordinates(point, windows), data.seen > 0
-    each = range(len(e))
     residual = np.concatenate([e[r, s] for r, s in enumerate(seen)])
     deviation = np.sqrt(np.mean(residual**2, axis=0))
     scale = np.maximum(deviation, LEAST_SCALE * problem.dataset.noise)
@@ -76,21 +76,7 @@ def report(
     covariance = _spread_out(sandwich(parts, H), moves)
     names, specs = m.parameter_names, m.parameter_specifications
     finer = finer_steps(problem, end, e, scale, parts, H, covariance)
-    combinations: list[Combination | None] = []
-    local: dict[str, tuple[Estimate, ...]] = {}
-    for i, name in enumerate(names):
-        if name in m.trusted:
-            combinations.append(None)
-        elif i in point.local:
-            rows = [int(coordinates.local_columns(r)[point.local.index(i)]) for r in each]
-            combinations.append(Combination(rows, stretch[:, i] / len(rows)))
-            own = [
-                Combination([row], factor) for row, factor in zip(rows, stretch[:, i : i + 1], strict=True)
-            ]
-            kinds = [specs[i]] * len(rows)
-            local[name] = estimates([name] * len(rows), values[:, i], kinds, own, covariance)
-        else:
-            combinations.append(Combination([point.free.index(i)], stretch[:1, i]))
+    combinations = _combinations(m, point, coordinates, stretch)
     free = [c for c in combinations if c is not None]
     free_names = tuple(name for name, c in zip(names, combinations, strict=True) if c is not None)
     rows = [(name, c.rows) for name, c in zip(free_names, free, strict=True)]
@@ -110,13 +96,70 @@ def report(
         free_names=free_names,
         steps=end.steps,
         history=tuple(end.history),
-        local=local,
+        local=_local_estimates(m, point, coordinates, values, stretch, covariance),
         remarks=(*at_bounds(found), *beyond_recordings(fitted, reach), *coarse_step(finer, rows)),
         options=options or FitOptions(),
         Ts=problem.dataset.recordings[0].Ts,
         n_init=problem.dataset.recordings[0].n_init,
         data=digest_of_recordings(problem.dataset.recordings),
     )
+
+
+def _combinations(
+    m: Mechanism, point: FitPoint, coordinates: FitCoordinates, stretch: Float[np.ndarray, "R P"]
+) -> list[Combination | None]:
+    """Each parameter as a combination of the coordinates, a local one as its mean; None for a trusted one.
+
+    Args:
+        m: The mechanism.
+        point: Says which parameters are common and which are local.
+        coordinates: The coordinates of the fit.
+        stretch: Derivatives of the values of each recording by the unconstrained ones.
+    """
+
+    def combination(i: int, name: str) -> Combination | None:
+        if name in m.trusted:
+            return None
+        if i not in point.local:
+            return Combination([point.free.index(i)], stretch[:1, i])
+        rows = _local_rows(point, coordinates, i, len(stretch))
+        return Combination(rows, stretch[:, i] / len(rows))
+
+    return [combination(i, name) for i, name in enumerate(m.parameter_names)]
+
+
+def _local_estimates(
+    m: Mechanism,
+    point: FitPoint,
+    coordinates: FitCoordinates,
+    values: Float[np.ndarray, "R P"],
+    stretch: Float[np.ndarray, "R P"],
+    covariance: Float[np.ndarray, "M M"],
+) -> dict[str, tuple[Estimate, ...]]:
+    """Local parameter -> its estimates in each recording.
+
+    Args:
+        m: The mechanism.
+        point: Says which parameters are common and which are local.
+        coordinates: The coordinates of the fit.
+        values: Values of the parameters in each recording.
+        stretch: Their derivatives by the unconstrained ones.
+        covariance: Covariance of the coordinates.
+    """
+    found = {}
+    for i in sorted(point.local):
+        name, R = m.parameter_names[i], len(values)
+        rows = _local_rows(point, coordinates, i, R)
+        own = [Combination([row], factor) for row, factor in zip(rows, stretch[:, i : i + 1], strict=True)]
+        kinds = [m.parameter_specifications[i]] * R
+        found[name] = estimates([name] * R, values[:, i], kinds, own, covariance)
+    return found
+
+
+def _local_rows(point: FitPoint, coordinates: FitCoordinates, i: int, recordings: int) -> list[int]:
+    """The coordinate of a local parameter in each recording."""
+    k = point.local.index(i)
+    return [int(coordinates.local_columns(r)[k]) for r in range(recordings)]
 
 
 def _spread_out(covariance: np.ndarray, moves: np.ndarray) -> np.ndarray:
