@@ -12,7 +12,8 @@ from rotflex_jax.errors import InputError
 from rotflex_jax.export import to_c
 from rotflex_jax.joints import paper, single_inertia
 from rotflex_jax.mechanism import Exponential, Mechanism, SmoothRK4, free_run, simulate, simulate_states
-from rotflex_jax.mechanism.elastic_teeth import Cubic, contact, swing
+from rotflex_jax.mechanism.elastic_teeth import contact, swing
+from rotflex_jax.mechanism.gear import Cubic
 from rotflex_jax.mechanism.roles import search_places
 from rotflex_jax.models.model import Model
 from rotflex_jax.runtime.xla import double_precision

@@ -22,34 +22,13 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from rotflex_jax.mechanism.assembly import Constants, Layout
-from rotflex_jax.mechanism.gear import Advance, crossing_time, delayed
+from rotflex_jax.mechanism.gear import Advance, Cubic, crossing_time, delayed
 from rotflex_jax.mechanism.mechanism import Mechanism
 from rotflex_jax.mechanism.small_matrices import matvec
 
 # Number of intervals in which the first sign change of the tooth torque is searched, and how often the first
 # of these intervals is halved.
 LOOKS, HALVINGS = 8, 3
-
-
-class Cubic(NamedTuple):
-    """`a + b t + d t^2 + e t^3` with the time in units of the step."""
-
-    a: Float[Array, "*S"]
-    b: Float[Array, "*S"]
-    d: Float[Array, "*S"]
-    e: Float[Array, "*S"]
-
-    def at(self, t: Float[Array, "*S"]) -> Float[Array, "*S"]:
-        """Value at `t`."""
-        return self.a + t * (self.b + t * (self.d + t * self.e))
-
-    def slope(self, t: Float[Array, "*S"]) -> Float[Array, "*S"]:
-        """Derivative at `t`."""
-        return self.b + t * (2 * self.d + 3 * t * self.e)
-
-    def integral(self, t: Float[Array, "*S"]) -> Float[Array, "*S"]:
-        """Integral from 0 to `t`."""
-        return t * (self.a + t * (self.b / 2 + t * (self.d / 3 + t * self.e / 4)))
 
 
 class Swing(NamedTuple):
@@ -207,7 +186,7 @@ def _until_zero(o: Oscillator, span: Array) -> Array:
     # The cubic with the values and slopes at both ends, in units of the interval.
     (f0, d0), (f1, d1) = first, last
     d0, d1, rise = d0 * width, d1 * width, f1 - f0
-    cubic = Cubic(f0, d0, 3 * rise - 2 * d0 - d1, d0 + d1 - 2 * rise)
+    cubic = Cubic.through(f0, rise, d0, d1)
     drop = jnp.where(found, -rise, 1.0)
     share = jnp.where(found, f0, 0.0) / drop
     for _ in range(3):
@@ -240,7 +219,7 @@ def elastic_step(
     side = jnp.where(held, side0, jnp.where(ends > 0, 1.0, -1.0))
     # The cubic through both ends of the flight, in units of the step.
     travel, b, last = side * (ends - r), c.h * side * s, c.h * side * speed
-    flight = Cubic(side * r - gap, b, 3 * travel - 2 * b - last, b + last - 2 * travel)
+    flight = Cubic.through(side * r - gap, travel, b, last)
     impacts = ~held & (flight.a <= 0) & (flight.a + travel > 0)
     start = _impact_time(flight, travel, impacts)
     touching = held | impacts

@@ -232,6 +232,38 @@ def delayed(t: Float[Array, "*S"], response: Float[Array, "n *S"], layout: Layou
     return response * jnp.stack([(1 - t) ** 2 if i in positions else 1 - t for i in range(len(response))])
 
 
+class Cubic(NamedTuple):
+    """`a + b t + d t^2 + e t^3` with the time in units of the step."""
+
+    a: Float[Array, "*S"]
+    b: Float[Array, "*S"]
+    d: Float[Array, "*S"]
+    e: Float[Array, "*S"]
+
+    @classmethod
+    def through(
+        cls,
+        first: Float[Array, "*S"],
+        rise: Float[Array, "*S"],
+        slope: Float[Array, "*S"],
+        last: Float[Array, "*S"],
+    ) -> "Cubic":
+        """The cubic over a step with a first value, a rise, and slopes at the beginning and the end."""
+        return cls(first, slope, 3 * rise - 2 * slope - last, slope + last - 2 * rise)
+
+    def at(self, t: Float[Array, "*S"]) -> Float[Array, "*S"]:
+        """Value at `t`."""
+        return self.a + t * (self.b + t * (self.d + t * self.e))
+
+    def slope(self, t: Float[Array, "*S"]) -> Float[Array, "*S"]:
+        """Derivative at `t`."""
+        return self.b + t * (2 * self.d + 3 * t * self.e)
+
+    def integral(self, t: Float[Array, "*S"]) -> Float[Array, "*S"]:
+        """Integral from 0 to `t`."""
+        return t * (self.a + t * (self.b / 2 + t * (self.d / 3 + t * self.e / 4)))
+
+
 class Impact(NamedTuple):
     """Teeth that come into contact within the step.
 
@@ -266,17 +298,17 @@ def _impact(
         impacts: Where the rotor passes it; elsewhere the result is any finite number.
         c: Constants.
     """
-    # The cubic through both ends, in units of the step: r + b t + d t^2 + e t^3.
+    # The cubic through both ends, in units of the step.
     travel, b, last = angle - r, c.h * s, c.h * speed
-    d, e = 3 * travel - 2 * b - last, b + last - 2 * travel
+    flight = Cubic.through(r, travel, b, last)
     t = jnp.where(impacts, crossing_time(stop - r, b, travel - b), 0.0)
     for _ in range(2):
-        slope = b + t * (2 * d + 3 * t * e)
+        slope = flight.slope(t)
         safe = impacts & (slope * stop > 0)
-        miss = r + t * (b + t * (d + t * e)) - stop
+        miss = flight.at(t) - stop
         t = t - jnp.where(safe, miss, 0.0) / jnp.where(safe, slope, 1.0)
         t = jnp.where(t < 0, 0.0, jnp.where(t > 1, 1.0, t))
-    slope = b + t * (2 * d + 3 * t * e)
+    slope = flight.slope(t)
     mass = c.gear.mass / c.h**2
     impulse, after = mass * slope, mass * (last - slope)
     rests = after * stop >= 0
