@@ -1,6 +1,7 @@
 """Structural identifiability against known results, and practical identifiability from a recording."""
 
 import dataclasses
+import importlib
 import json
 from fractions import Fraction
 
@@ -10,7 +11,7 @@ import pytest
 import rotflex_jax as rf
 from rotflex_jax import joints
 from rotflex_jax.effects import Coulomb, CurrentDrive, Inertia, LoadFriction, Spring, Viscous
-from rotflex_jax.fit.identifiable import Identifiability, identifiable
+from rotflex_jax.fit.identifiable import Identifiability, _information, _other_inputs, identifiable
 from rotflex_jax.fit.structural_identifiability import Dual, impulse_slopes, null_space, random_values
 from rotflex_jax.mechanism import Mechanism, linearise
 
@@ -203,6 +204,60 @@ def test_standard_deviations_of_a_recording_are_those_of_least_squares():
         assert of_fit.std[name] == pytest.approx(std, rel=1e-6)
         assert found.std[name] == pytest.approx(std, rel=0.5)  # without the part by correlation in time
     assert found.structural
+
+
+def test_unknown_first_states_take_their_part_of_the_information():
+    """Reference: the covariance of the parameters is their block of the covariance of all coordinates."""
+    J, noise = np.random.default_rng(3).normal(size=(40, 2, 5)), np.array([0.5, 2.0])
+    rows = np.concatenate([J[:, 0] / 0.5, J[:, 1] / 2.0])
+    of_all = np.linalg.inv(rows.T @ rows)
+    np.testing.assert_allclose(np.linalg.inv(_information(J, noise, 3)), of_all[:3, :3], rtol=1e-9)
+
+
+def test_what_would_help_is_what_it_brings(monkeypatch):
+    """Reference for a further sensor: the machine that has it, with the relative noise of the best sensor.
+
+    With three times the input from rest, all slopes of a linear machine are three times as large.
+    """
+    module = importlib.import_module("rotflex_jax.fit.identifiable")
+    with_arm = dataclasses.replace(JOINT, outputs={"theta": "hub", "alpha": "joint", "arm": "arm"})
+    u = rf.data.excitation.noise(600, 0.004, seed=2, rms=2.0)
+    y = rf.simulate(with_arm, u, 0.004)
+    y = y + np.std(y, axis=0) * [1.0, 0.1, 0.1] * np.random.default_rng(4).normal(size=y.shape)
+    rec = rf.Recording(u=u, y=y, Ts=0.004, channels=with_arm.channels, units=("rad",) * 3)
+    usual = identifiable(JOINT, rec)
+    monkeypatch.setattr(module, "BADLY_KNOWN", 0.0)
+    monkeypatch.setattr(module, "HELPS", 1e-9)
+    every = identifiable(JOINT, rec)
+    worst = every.badly_known[0].std
+    reference = identifiable(with_arm, rec).badly_known[0].std
+    assert every.sensors_here["the position of arm"] == pytest.approx(reference, rel=0.2)
+    assert every.inputs_here["an input three times as large"] == pytest.approx(worst / 3, rel=0.05)
+    for few, all_of_them in (
+        (usual.trust_here, every.trust_here),
+        (usual.sensors_here, every.sensors_here),
+        (usual.inputs_here, every.inputs_here),
+    ):
+        assert few == {name: std for name, std in all_of_them.items() if std < worst / 3}
+    # A fit whose standard deviations are twice as large: so is all that would be left with any help.
+    fit = rf.fit(JOINT, rec)
+    narrow, wide = (
+        identifiable(dataclasses.replace(fit, covariance=k * fit.covariance), rec) for k in (1.0, 4.0)
+    )
+    for which in ("trust_here", "sensors_here", "inputs_here"):
+        a, b = getattr(narrow, which), getattr(wide, which)
+        assert a and b == pytest.approx({name: 2 * std for name, std in a.items()}, rel=1e-6)
+
+
+def test_other_inputs_are_as_large_as_they_say():
+    u = np.random.default_rng(5).normal(size=400)
+    others = _other_inputs(u, 0.01)
+    np.testing.assert_allclose(others["an input three times as large"], 3 * u)
+    noise = others["noise of the same rms"]
+    assert np.mean(noise**2) == pytest.approx(np.mean(u**2))
+    slow = others["three slow swings of the same peak"]
+    assert np.max(np.abs(slow)) == pytest.approx(np.max(np.abs(u)), rel=1e-3)
+    assert int(np.argmax(np.abs(np.fft.rfft(slow)))) == 3
 
 
 def test_it_is_shown_and_written():
