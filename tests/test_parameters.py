@@ -122,6 +122,7 @@ def test_an_estimate_says_what_it_is(free):
     [
         (1.20012, 2e-5, "1.200120 N m/rad  [1.200080, 1.200160]"),
         (1.25, 0.1, "1.25 N m/rad  [1.05, 1.45]"),
+        (12.3, 0.3, "12.30 N m/rad  [11.70, 12.90]"),
         (-431.2, 20.0, "-431 N m/rad  [-471, -391]"),
         (2.5e-6, 1e-8, "2.500e-06 N m/rad  [2.480e-06, 2.520e-06]"),
         (1.20012, 0.0, "1.20012 N m/rad  [1.20012, 1.20012]"),
@@ -139,3 +140,16 @@ def test_an_estimate_tells_that_it_is_at_a_bound(value, word):
     spec = Specification(unit="", typical=1.0, lower=0.0, upper=10.0)
     note = Estimate.of("x", value, 0.1, spec).note
     assert note == (f"at its {word} bound" if word else "")
+
+
+@pytest.mark.parametrize(("std", "near"), [(0.002, False), (0.004, True)])
+def test_an_estimate_near_a_bound_is_at_it_if_its_interval_includes_the_bound(std, near):
+    """At 0.005 from the bound, 1.96 standard deviations are 0.0039 and 0.0078."""
+    spec = Specification(unit="", typical=1.0, lower=0.0)
+    assert Estimate.of("x", 0.005, std, spec).note == ("at its lower bound" if near else "")
+
+
+@pytest.mark.parametrize(("value", "healthy"), [(-0.01, False), (0.0, True), (1.0, True), (1.01, False)])
+def test_an_estimate_outside_its_physical_range_on_either_side_says_so(value, healthy):
+    spec = Specification(unit="", typical=1.0, physical=(0.0, 1.0))
+    assert Estimate.of("x", value, 0.1, spec).note == ("" if healthy else "outside its physical range")
