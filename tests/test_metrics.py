@@ -88,6 +88,13 @@ def test_errors_in_windows_by_hand() -> None:
     np.testing.assert_allclose(found, [np.sqrt(squares / (40 + 33)), 0.5], rtol=1e-12)
 
 
+def test_a_window_is_at_least_twice_as_long_as_its_first_samples() -> None:
+    """Of 100 samples with `n_init` of 8: windows of 16, and the last one takes the rest of 4."""
+    r = Recording(u=np.arange(100.0), y=np.arange(100.0), Ts=0.1, n_init=8)
+    starts, longest = metrics.window_starts(r, 1e-3)
+    assert starts.tolist() == [0, 16, 32, 48, 64, 80] and longest == 20
+
+
 def test_single_precision_stays_single() -> None:
     assert metrics.rmse(Y.astype(np.float32), (Y - E).astype(np.float32)).dtype == np.float32
 

@@ -92,6 +92,7 @@ def test_outliers_are_named_with_time_and_value_and_no_unit(channel, where, valu
     bad = table(**{channel: changed(clean, where, value)})
     said = refused(bad)
     assert f"'{channel}' is {value:.4g} rad" in said and "at 0.75 s (sample 300)" in said
+    assert f"after {clean[299]:.4g} rad" in said
     assert f"{np.sum(bad[channel] != clean)} of {len(T)} samples" in said
     assert "remove or interpolate" in said and "looks like" not in said
     assert kinds(bad) == ["outliers"]  # and no other fault is reported

@@ -104,6 +104,7 @@ def test_input_beyond_a_hundred_volts_looks_like_millivolts(share: float, found:
 @pytest.mark.parametrize(("share", "found"), [(0.999, False), (1.001, True)])
 def test_deflection_beyond_half_a_turn_looks_like_degrees(share: float, found: bool) -> None:
     assert ("units alpha" in kinds(alpha=np.pi * share * WAVE[::-1])) == found
+    assert ("units alpha" in kinds(alpha=-np.pi * share * np.abs(WAVE[::-1]))) == found  # to one side
 
 
 @pytest.mark.parametrize(
@@ -129,6 +130,13 @@ def test_times_are_even_to_a_hundredth(late: float, said: str | None) -> None:
         return
     with pytest.raises(InputError, match=said):
         even_spacing(t, "Time")
+
+
+@pytest.mark.parametrize("rate", [610.35, 500.0, 300.0])
+def test_only_a_short_period_is_rounded(rate: float) -> None:
+    """Times that are rounded to 1 ns; the period is exact if it is a short number, else it is the mean."""
+    period = even_spacing(np.round(np.arange(2000) / rate, 9), "Time")
+    assert period == (0.002 if rate == 500.0 else pytest.approx(1 / rate, rel=1e-9))
 
 
 @pytest.mark.parametrize(("volts", "accepted"), [(0.0, False), (8e-13, False), (1.2e-12, True)])
