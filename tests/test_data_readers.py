@@ -307,6 +307,13 @@ def test_a_servo_log_is_resampled_and_ends_with_the_torque(tmp_path: Path) -> No
     assert rest is not None and rest.start == t[150] and t[-1] - 0.005 < rest.t[-1] <= t[-1] + 1e-9
     np.testing.assert_allclose(rest.y[:, 0], rest.t - 1, atol=1e-12)
     assert dict(rest.constants) == {"hub.position_servo.gain": 300.0, "hub.position_servo.enabled": 0.0}
+    # It ends where the torque is on again.
+    run = json.loads((tmp_path / "long.json").read_text())
+    for entry in run["entries"][380:]:
+        entry["torque_enable"] = True
+    (tmp_path / "again.json").write_text(json.dumps(run))
+    rest = load_bam_xl330_released(tmp_path / "again.json")
+    assert rest is not None and rest.start == t[150] and t[379] - 0.005 < rest.t[-1] <= t[379] + 1e-9
 
 
 @pytest.mark.parametrize(

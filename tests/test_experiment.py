@@ -183,6 +183,15 @@ def test_one_input_follows_another_within_the_slew(before):
     np.testing.assert_allclose(u[10:], other[10:], atol=1e-12)
 
 
+@pytest.mark.parametrize("before", [-2.0, -1.0, 1.0, 2.0])
+def test_a_start_beyond_one_step_counts_as_one_step(before):
+    """Else an input could not be scaled down: a smaller first sample would be too far from the start."""
+    limits, step = Limits(voltage=2.0, slew=150.0), 150.0 * Ts
+    u = limits.playable(np.zeros(20), Ts, before * step)
+    assert np.max(np.abs(np.diff(u, append=0.0))) <= step * (1 + 1e-9)
+    np.testing.assert_allclose(u, np.zeros(20), atol=1e-9 * step)
+
+
 def test_each_sample_follows_the_two_it_is_said_to_follow():
     limits, rng = Limits(voltage=2.0, slew=150.0), np.random.default_rng(6)
     x = 1.5 * rng.standard_normal(300)

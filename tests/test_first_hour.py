@@ -68,6 +68,11 @@ def test_whole_degrees_are_no_counts() -> None:
     whole = np.round(np.rad2deg(RECORDING.y))
     found = rf.load(frame(theta=whole[:, 0], alpha=whole[:, 1]), degrees=True)
     assert np.allclose(np.rad2deg(found.y), whole)
+    # No arm deflects over more than 90 degrees, while a hub may turn further.
+    hub, arm = np.round(400 * THETA / np.ptp(THETA)), np.round(92 * ALPHA / np.ptp(ALPHA))
+    with pytest.raises(InputError, match="'alpha' holds whole numbers"):
+        rf.load(frame(theta=hub, alpha=arm), degrees=True)
+    assert rf.load(frame(theta=hub, alpha=np.round(0.9 * arm)), degrees=True).N == RECORDING.N
 
 
 @pytest.mark.parametrize(
