@@ -57,6 +57,7 @@ from rotflex_jax.effects import (
     Stribeck,
     TorqueSaturation,
     Viscous,
+    ViscousAsymmetric,
     VoltageOffset,
     register,
 )
@@ -440,6 +441,57 @@ def test_sentence_is_for_people(cls):
     assert not said.endswith(".") and "nan" not in said and "None" not in said
     if not isinstance(effect, Actuation):
         assert effect.port in said
+
+
+def of_law(effect, position=0.0, speed=0.0, drive=0.0):
+    """Torque of a law [N m]."""
+    return float(effect.force(position, speed, drive))
+
+
+def forwards_less_backwards(effect):
+    """By how much more torque a motion of 1 rad/s is opposed forwards than backwards [N m]."""
+    return -of_law(effect, speed=1.0) - of_law(effect, speed=-1.0)
+
+
+def per_volt(motor):
+    """Torque at rest [N m/V] and speed without a load [rad/s per V], from the equations of motion."""
+    stamp = motor.stamp()
+    return stamp.drive, stamp.drive / stamp.damping
+
+
+def between_stops(gear):
+    """Angle over which the rotor turns alone [deg]."""
+    return math.degrees(2 * gear.stops())
+
+
+MOTOR = Motor("hub", 0.01, 0.012, resistance=2.0, gear_ratio=50.0, efficiency=0.8)
+
+
+@pytest.mark.parametrize(
+    ("effect", "number", "says"),
+    [
+        (Viscous("hub", -0.013), lambda e: e.stamp().damping, "is damped less .* by {:.3g} N m s"),
+        (ViscousAsymmetric("hub", 0.013), forwards_less_backwards, "{:.3g} N m s/rad stronger forwards"),
+        (ViscousAsymmetric("hub", -0.013), forwards_less_backwards, "{:.3g} N m s/rad stronger backwards"),
+        (QuadraticDrag("arm", 0.013), lambda e: of_law(e, speed=1.0), "{:.3g} N m at 1 rad/s"),
+        (CubicSpring("joint", 13.0), lambda e: of_law(e, 0.1), "hardens .* by {:.3g} N m at 0.1 rad"),
+        (CubicSpring("joint", -13.0), lambda e: of_law(e, 0.1), "softens .* by {:.3g} N m at 0.1 rad"),
+        (QuadraticSpring("joint", 1.3), lambda e: of_law(e, 0.1), "positive .* by {:.3g} N m at 0.1 rad"),
+        (QuadraticSpring("joint", -1.3), lambda e: of_law(e, -0.1), "negative .* by {:.3g} N m at 0.1 rad"),
+        (MOTOR, lambda e: per_volt(e)[0], "{:.3g} N m per volt at rest"),
+        (MOTOR, lambda e: per_volt(e)[1], "runs free at {:.3g} rad/s per volt"),
+        (CATALOG["backlash"]("hub", 0.004), between_stops, "a play of {:.3g} deg"),
+        (CATALOG["elastic_backlash"]("hub", 0.004), between_stops, "a play of {:.3g} deg"),
+    ],
+)
+def test_numbers_of_a_sentence_are_those_of_the_law(effect, number, says):
+    assert re.search(says.format(abs(number(effect))), effect.sentence())
+
+
+def test_half_of_the_torque_is_lost_where_the_sentence_says():
+    found = re.search(r"would give (\S+) N m", TorqueSaturation("hub", loss=0.4).sentence())
+    torque = float(found[1])
+    assert of_law(TorqueSaturation("hub", loss=0.4), drive=torque) == pytest.approx(-torque / 2)
 
 
 @pytest.mark.parametrize(
