@@ -9,6 +9,7 @@ from linear_joint import PAPER, POLES, impulse_response
 from scipy.signal import lfilter
 
 from rotflex_jax.basis import Orthonormal, Volterra, minimum_nmse
+from rotflex_jax.basis.orthonormal import coordinates, numbers_of
 from rotflex_jax.errors import InputError
 from rotflex_jax.runtime.xla import double_precision
 
@@ -152,3 +153,12 @@ def test_a_gradient_goes_through_the_poles() -> None:
 def test_bad_input_is_told_in_a_sentence(make, sentence: str) -> None:
     with pytest.raises(InputError, match=sentence):
         make()
+
+
+def test_coordinates_without_bounds_give_the_poles_back() -> None:
+    """Real poles of either sign, and pairs left and right of the imaginary axis."""
+    bank = Orthonormal((-0.4, 0.7, 0.6 + 0.3j, 0.6 - 0.3j, -0.2 + 0.5j, -0.2 - 0.5j))
+    z, signs = coordinates(bank.kinds, np.asarray(bank.numbers))
+    with double_precision():
+        numbers = numbers_of(bank.kinds, signs, jnp.asarray(z))
+    np.testing.assert_allclose(numbers, bank.numbers, rtol=1e-9)

@@ -439,10 +439,18 @@ def test_input_of_a_fit_in_other_forms() -> None:
     refused("sampling period", lambda: identified_kernels(fit, 4, recording.decimate(2)))
 
 
-def test_sizes_are_standard_deviations_under_a_gaussian_input() -> None:
-    kernels = some()
-    y = kernels.response(np.random.default_rng(14).normal(size=400_000))
+@pytest.mark.parametrize("a", [0.0, 0.8])
+def test_sizes_are_standard_deviations_under_a_gaussian_input(a: float) -> None:
+    """White noise, and a first-order process of unit variance, whose covariance is `a^|k - j|`."""
+    kernels = dataclasses.replace(some(), covariance=scipy.linalg.toeplitz(a ** np.arange(4)) if a else None)
+    white = np.random.default_rng(14).normal(size=400_000)
+    y = kernels.response(lfilter([np.sqrt(1 - a**2)], [1, -a], white))
     assert np.std(y) == pytest.approx(np.hypot(*kernels.sizes), rel=0.01)
+
+
+def test_kernels_about_two_levels_agree_if_one_is_the_other_one_moved() -> None:
+    kernels = some()
+    assert kernels.against(kernels.moved(0.7)).relative == pytest.approx((0.0, 0.0), abs=1e-12)
 
 
 def test_standard_errors_pass_from_weights_to_kernels() -> None:
