@@ -8,7 +8,7 @@ import scipy
 from spindle import PAIRS, SPINDLE, spun
 
 import rotflex_jax as rf
-from rotflex_jax.discover.explanation import advice, coloured_noise
+from rotflex_jax.discover.explanation import _is_white, advice, coloured_noise
 from rotflex_jax.discover.tables import next_steps
 
 N, Ts = 3000, 0.004
@@ -36,6 +36,11 @@ def test_an_ar1_is_told_with_its_coefficient(a: float) -> None:
     assert np.mean(told) == pytest.approx(a, abs=0.02)
 
 
+def beside(x: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """The part of a signal that is orthogonal to another one."""
+    return x - (x @ known) / (known @ known) * known
+
+
 # Errors that are no AR(1), or that depend on the motion; each is tested in 10 recordings.
 OTHER = {
     "white": lambda rng, u, m: rng.standard_normal(N),
@@ -43,6 +48,12 @@ OTHER = {
     "of the input": lambda rng, u, m: ar1(rng, 0.9) + scipy.signal.lfilter([0.5], [1, -0.9], u / u.std()),
     "of the sign of the speed": lambda rng, u, m: scipy.signal.lfilter(
         [1], [1, -0.9], rng.standard_normal(N) + 0.3 * np.sign(m[:, 1])
+    ),
+    "of the sign of the speed but not of the speed": lambda rng, u, m: scipy.signal.lfilter(
+        [1], [1, -0.9], rng.standard_normal(N) + 0.3 * beside(np.sign(m[:, 1]), m[:, 1])
+    ),
+    "larger in one direction": lambda rng, u, m: scipy.signal.lfilter(
+        [1], [1, -0.9], rng.standard_normal(N) * np.where(m[:, 1] > 0, 1.5, 1.0)
     ),
     "larger where it is fast": lambda rng, u, m: scipy.signal.lfilter(
         [1], [1, -0.9], rng.standard_normal(N) * (0.5 + (m[:, 1] / m[:, 1].std()) ** 2)
@@ -61,6 +72,12 @@ def test_what_is_something_else_is_not_told(kind: str) -> None:
         e = OTHER[kind](np.random.default_rng(100 + seed), u, motion)
         told += coloured_noise(e, motion, u, Ts) is not None
     assert told <= 1
+
+
+def test_errors_that_alternate_are_not_white() -> None:
+    """Differences of white noise have the correlation -1/2 from one sample to the next."""
+    e = np.random.default_rng(1).standard_normal(4000)
+    assert _is_white(e) and not _is_white(np.diff(e)) and not _is_white(np.cumsum(e))
 
 
 def test_short_errors_say_nothing() -> None:

@@ -217,3 +217,13 @@ def test_simulate_writes_a_page(run, recorded, tmp_path) -> None:  # noqa: F811
         rf.metrics.fit_percent(rec, y_hat)["alpha"]
     )
     assert f"{written['errors']['theta']['fit_percent']:.1f}" in page
+
+
+def test_a_steady_drift_changes_no_frequency_response() -> None:
+    """A straight line is taken out of each stretch, so that it adds nothing to low frequencies."""
+    u = np.random.default_rng(6).standard_normal(4000)
+    y = signal.lfilter([0.1], [1.0, -0.9], u)[:, None]
+    drift = 0.01 * np.arange(4000)[:, None] - 7.0
+    steady, drifting = frequency_response(u, y, 0.01), frequency_response(u, y + drift, 0.01)
+    np.testing.assert_allclose(drifting.response, steady.response, rtol=1e-6)
+    np.testing.assert_allclose(drifting.coherence, steady.coherence, rtol=1e-6)
