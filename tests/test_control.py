@@ -2,9 +2,11 @@
 
 import ctypes
 import dataclasses
+import functools
 import shutil
 import subprocess
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -16,6 +18,7 @@ import rotflex_jax as rf
 from rotflex_jax import effects as fx
 from rotflex_jax.cli import main
 from rotflex_jax.control import close_loop, controller_to_c, credible_models
+from rotflex_jax.control.assessment import ControlAssessment
 from rotflex_jax.control.closed_loop import run_loop
 from rotflex_jax.control.design import AT_REST, Tracking, torques_along
 from rotflex_jax.errors import InputError
@@ -274,6 +277,17 @@ def test_the_assessment_names_the_model_that_breaks_the_loop():
     assert "late: limit cycle" in report.sentence and "held" in str(report)
     assert report.to_dict()["runs"]["as designed"]["limit_cycle"] is None
     assert rf.assess(found, [JOINT + fx.Delay(time=0.001)], swing(still=0.0), hold=3.0).broken == {}
+
+
+def test_the_worst_model_has_the_largest_mean_square_error():
+    """Not the largest error, which a single moment may have. Errors are shown in degrees, shares in %."""
+    run = functools.partial(SimpleNamespace, unit="rad", bounded=True, limit_cycle=None)
+    report = ControlAssessment(
+        None,
+        {"a": run(rms=0.02, largest=0.03, saturated=0.25), "b": run(rms=0.01, largest=0.1, saturated=0.0)},
+    )
+    assert report.worst == "a" and "Worst case of 2 models: 1.15 deg rms with a; no limit" in report.sentence
+    assert str(report).splitlines()[2].split() == ["a", "held", "1.15", "1.72", "25.0"]
 
 
 def test_an_amplifier_that_remembers_longer_than_the_loop_is_refused():
