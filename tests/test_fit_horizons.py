@@ -217,6 +217,14 @@ def test_a_size_that_no_signal_reaches_is_said():
     assert [r.parameter for r in beyond_recordings(slow, reach)] == ["hub.stribeck.speed"]
 
 
+@pytest.mark.parametrize(("seconds", "beyond"), [(9.9, False), (10.1, True)])
+def test_a_lag_longer_than_the_recording_is_beyond_it(seconds, beyond):
+    reach = Reach(input=1.0, position={}, speed={}, seconds=10.0)
+    found = beyond_recordings(paper() + fx.Lag(time=seconds), reach)
+    assert [r.parameter for r in found] == ["input.lag.time"] * beyond
+    assert all("a third of the recording: 3.33 s" in r.sentence for r in found)
+
+
 def test_a_cogging_that_repeats_less_than_half_a_time_is_beyond_the_recordings():
     """Half a period within the motion is a phase of pi; the limit is 3 rad."""
     cogging = fx.Cogging(at="hub", sine=0.01, periods=4.0)
