@@ -74,8 +74,8 @@ def bands(result: SimpleNamespace, recording: rf.Recording, **known: rf.Recordin
 
 def per_volt(recording: rf.Recording) -> np.ndarray:
     """Change of the angle by an offset of 1 V, less the part that a fitted first state removes [rad/V]."""
-    t = TS * np.arange(N)
-    X, moved = np.column_stack([np.ones(N), t]), TORQUE_PER_VOLT * t**2 / 2
+    t = TS * np.arange(recording.N)
+    X, moved = np.column_stack([np.ones(len(t)), t]), TORQUE_PER_VOLT * t**2 / 2
     head = slice(0, recording.n_init)
     return np.abs(moved - X @ np.linalg.lstsq(X[head], moved[head])[0])
 
@@ -116,6 +116,9 @@ def test_one_run_alone_says_how_large_an_offset_may_be():
     found = bands(result, other)
     np.testing.assert_allclose(found.middle, result.model.simulate(other), atol=1e-9)
     np.testing.assert_allclose(found.parts[OWN][:, 0], 0.2 * per_volt(other), rtol=0.05, atol=1e-9)
+    # A part of the fitted run is simulated without its offset too, so its band is as wide.
+    part = bands(result, validation)
+    np.testing.assert_allclose(part.parts[OWN][:, 0], 0.2 * per_volt(validation), rtol=0.05, atol=1e-9)
 
 
 def test_whole_runs_that_were_fitted_say_what_the_final_fit_lacks():
@@ -149,6 +152,10 @@ def test_sets_do_not_give_another_run_the_offset_of_the_only_one():
     assert OWN not in same.parts and same.coverage()["theta"] > 0.8
     result.validation = (other,)  # two runs were compared, so the offset belongs to the machine
     assert OWN not in bands_of_sets(result, [(fit, 1.0)], run(8, 0.2), 0.9, ()).parts
+    # An offset of the user's own model belongs to the machine too.
+    result.validation = (validation,)
+    result.baseline = SimpleNamespace(model=rf.Model(axis() + VoltageOffset("input")))
+    assert OWN not in bands_of_sets(result, [(fit, 1.0)], other, 0.9, ()).parts
 
 
 def test_validation_data_say_what_the_sets_of_an_unexplained_search_lack():
