@@ -127,6 +127,8 @@ def value_and_interval(estimate: Estimate) -> tuple[str, str]:
     >>> nan = float("nan")
     >>> value_and_interval(Estimate("a", 0.0300069, 1e-5, (0.029987, 0.030027), "N m"))
     ('0.030007', '0.029987 … 0.030027')
+    >>> value_and_interval(Estimate("a", 2.5e-6, 1e-8, (2.48e-6, 2.52e-6), "N m"))
+    ('2.500 × 10⁻⁶', '(2.480 … 2.520) × 10⁻⁶')
     >>> value_and_interval(Estimate("a", 2.6, nan, (nan, nan), "ohm", free=False))
     ('2.6', '')
     """
