@@ -244,6 +244,8 @@ def test_nlms_fixed_point_is_least_squares_where_the_model_is_complete() -> None
         (lambda: LMS(-0.1), "`mu` must lie at or above 0 and be finite, but is -0.1"),
         (lambda: LMS(np.array([0.1, np.nan])), "`mu` must lie at or above 0 and be finite, but is nan"),
         (lambda: LMS("fast"), "`mu` must be a number"),
+        (lambda: LMS("0.1"), "`mu` must be a number or an array of numbers, but is '0.1'"),
+        (lambda: NLMS(True), "`mu` must be a number or an array of numbers, but is True"),
         (lambda: LMS(0.1, leakage=-1.0), "`leakage`"),
         (lambda: NLMS(eps=0.0), "`eps` must lie above 0"),
         (lambda: AffineProjection(window=0), "`window` must be a whole number from 1, but is 0"),
@@ -269,10 +271,27 @@ def test_settings_out_of_range_are_refused(make, phrase: str) -> None:
         (RLS(delta=np.ones(2)), "delta"),
         (Kalman(q=np.ones(2)), "q"),
         (Kalman(p0=np.ones(2)), "p0"),
+        (LMS(0.1, leakage=np.ones(2)), "leakage"),
+        (NLMS(np.ones(2)), "mu"),
+        (AffineProjection(np.ones(2)), "mu"),
     ],
 )
 def test_settings_per_weight_must_be_as_many_as_weights(filter, name: str) -> None:
     with pytest.raises(InputError, match=f"`{name}` must be one number or one for each of the 10 weights"):
+        run(filter, *noisy_record(20))
+
+
+@pytest.mark.parametrize(
+    ("filter", "name"),
+    [
+        (NLMS(eps=np.ones(10)), "eps"),
+        (AffineProjection(eps=np.ones(10)), "eps"),
+        (RLS(np.ones(10)), "lam"),
+        (Kalman(r=np.ones(10)), "r"),
+    ],
+)
+def test_settings_of_all_weights_are_one_number(filter, name: str) -> None:
+    with pytest.raises(InputError, match=f"`{name}` must be one number, but has the shape .10,.; give one"):
         run(filter, *noisy_record(20))
 
 

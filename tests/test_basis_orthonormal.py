@@ -132,6 +132,10 @@ def test_a_gradient_goes_through_the_poles() -> None:
     np.testing.assert_allclose(slope, by_difference, rtol=1e-7)
 
 
+def test_poles_from_a_generator_are_those_of_the_list() -> None:
+    assert Orthonormal(p for p in (0.5, 0.25)).poles == (0.5, 0.25)
+
+
 @pytest.mark.parametrize(
     ("make", "sentence"),
     [
@@ -141,6 +145,9 @@ def test_a_gradient_goes_through_the_poles() -> None:
         (lambda: Orthonormal((0.5 + 0.1j,)), r"needs its conjugate, but 0\.5\+0\.1j has none"),
         (lambda: Orthonormal((0.5 + 0.1j, 0.5 + 0.1j)), "needs its conjugate"),
         (lambda: Orthonormal((np.nan,)), "finite numbers"),
+        (lambda: Orthonormal(["0.5"]), "`poles` must list finite numbers, at least one, but is a list"),
+        (lambda: Orthonormal([True]), "`poles` must list finite numbers"),
+        (lambda: Orthonormal.at("fast", 0.01), "`continuous_poles` must list finite numbers, .* is 'fast'"),
         (lambda: Orthonormal.laguerre(0.5 + 0.1j, 3), "have one real pole"),
         (lambda: Orthonormal.laguerre(0.5, 0), "Argument `count` must be a whole number from 1"),
         (lambda: Orthonormal.kautz(0.5 + 0.1j, 3), "come in pairs, but 3"),

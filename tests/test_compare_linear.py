@@ -1,6 +1,7 @@
 """Linear models and Volterra series from data, compared with systems simulated by scipy and numpy."""
 
 import dataclasses
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -69,6 +70,25 @@ def test_a_signal_is_a_second_input(way: str) -> None:
     for column, expected in enumerate((from_input, from_base)):
         found = response(system, frequencies, column)
         np.testing.assert_allclose(found, expected, atol=2e-3 * np.abs(expected).max())
+
+
+def test_a_linear_system_takes_one_initial_sample_and_a_recording_in_a_list() -> None:
+    system = LinearSystem(
+        A=np.array([[0.5]]),
+        B=np.array([[1.0, 0.0]]),
+        C=np.array([[1.0]]),
+        D=np.zeros((1, 2)),
+        K=np.zeros((1, 1)),
+        Ts=0.1,
+    )
+    record = Recording(
+        u=np.ones(6), y=2 - 0.5 ** np.arange(-1.0, 5.0), Ts=0.1, accept=("short", "constant_input")
+    )
+    for run in (system.simulate([record]), system.predict([record])):
+        assert record.n_init == 1
+        np.testing.assert_allclose(run, record.y, atol=1e-12)  # x+ = 0.5 x + 1 from x = 0
+    with pytest.raises(rf.InputError, match="`recording` must be a Recording or a list of them, but is None"):
+        system.simulate(cast(Any, None))
 
 
 def test_a_linear_system_says_which_signal_a_recording_lacks() -> None:

@@ -68,6 +68,12 @@ def test_weights_cannot_be_changed_from_outside() -> None:
         series.weights[0] = 1.0
 
 
+def test_a_recording_may_come_in_a_list() -> None:
+    series = Series(Volterra(Delays(1)), np.array([0.5, 2.0, 0.0]), "alpha", 0.01)
+    np.testing.assert_allclose(series.simulate([recording()])[:, 0], 0.5 + 2.0 * recording().u)
+    assert np.array_equal(series.measured([recording()]), series.measured(recording()))
+
+
 @pytest.mark.parametrize(
     ("make", "sentence"),
     [
@@ -84,6 +90,7 @@ def test_weights_cannot_be_changed_from_outside() -> None:
             "period of 0.02 s, but the recording has 0.01",
         ),
         (lambda b: Series(b, np.ones(3), "tip", 0.01).measured(recording()), "no channel 'tip'"),
+        (lambda b: Series(b, np.ones(3), "alpha", 0.01).simulate(recording().u), "must be a Recording"),
     ],
 )
 def test_bad_input_is_told_in_a_sentence(make, sentence: str) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, Inexact, Real, Shaped
 
-from rotflex_jax.checks import all_finite
+from rotflex_jax.checks import all_finite, shown
 from rotflex_jax.errors import InputError
 
 
@@ -65,11 +65,13 @@ choose a value in this range.
     if isinstance(value, Tracer):
         return
     try:
-        numbers = np.asarray(value, float)
-    except (TypeError, ValueError) as error:
+        numbers = np.asarray(value)
+    except ValueError:  # rows of different lengths
+        numbers = np.asarray(None)
+    if numbers.dtype.kind not in "iuf":
         raise InputError(
-            f"Argument `{name}` must be a number or an array of numbers, but is {value!r}; give numbers."
-        ) from error
+            f"Argument `{name}` must be a number or an array of numbers, but is {shown(value)}; give numbers."
+        )
     good = (numbers > low if open_low else numbers >= low) & (numbers <= high) & np.isfinite(numbers)
     if not np.all(good):
         worst = np.ravel(numbers)[np.argmin(np.ravel(good))]
@@ -122,6 +124,19 @@ def per_weight(name: str, value: Any, size: int, dtype: Any) -> Inexact[Array, "
             f"shape {array.shape}; give {size} numbers."
         )
     return jnp.broadcast_to(array, (size,))
+
+
+def one_number(name: str, value: Any) -> None:
+    """Refuses a setting that has a value for each weight where the filter has one for all.
+
+    Raises:
+        InputError: the value is not one number.
+    """
+    if np.ndim(value):
+        raise InputError(
+            f"Argument `{name}` must be one number, but has the shape {np.shape(value)}; give one for all "
+            "weights."
+        )
 
 
 class Weights(NamedTuple):

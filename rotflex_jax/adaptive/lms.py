@@ -14,6 +14,7 @@ from rotflex_jax.adaptive.filter import (
     Weights,
     count,
     finite,
+    one_number,
     per_weight,
     real_data,
     times,
@@ -57,6 +58,7 @@ class LMS(AdaptiveFilter):
 
     def init(self, size: int, dtype: Any) -> Weights:
         """All weights zero."""
+        per_weight("leakage", self.leakage, size, dtype)
         return Weights(jnp.zeros(size, dtype))
 
     def step(
@@ -95,6 +97,8 @@ class NLMS(AdaptiveFilter):
 
     def init(self, size: int, dtype: Any) -> Weights:
         """All weights zero."""
+        per_weight("mu", self.mu, size, dtype)
+        one_number("eps", self.eps)
         return Weights(jnp.zeros(size, dtype))
 
     def step(
@@ -179,6 +183,8 @@ class AffineProjection(AdaptiveFilter):
     def init(self, size: int, dtype: Any) -> WindowState:
         """All weights zero, after silence."""
         real_data("AffineProjection", dtype)
+        per_weight("mu", self.mu, size, dtype)
+        one_number("eps", self.eps)
         K = self.window
         zeros = lambda *shape: jnp.zeros(shape, dtype)  # noqa: E731
         return WindowState(zeros(size), zeros(K, size), zeros(K), zeros(K, K))

@@ -9,6 +9,7 @@ from rotflex_jax.adaptive.filter import (
     AdaptiveFilter,
     Number,
     PerWeight,
+    one_number,
     per_weight,
     real_data,
     times,
@@ -92,6 +93,7 @@ class RLS(AdaptiveFilter):
     def init(self, size: int, dtype: Any) -> SquareRootState:
         """All weights zero, as uncertain as `delta` says."""
         real_data("RLS", dtype)
+        one_number("lam", self.lam)
         spread = jnp.sqrt(per_weight("delta", self.delta, size, dtype))
         return SquareRootState(jnp.zeros(size, dtype), jnp.diag(spread))
 
@@ -143,6 +145,7 @@ class Kalman(AdaptiveFilter):
     def init(self, size: int, dtype: Any) -> KalmanState:
         """All weights zero, with the variance `p0`."""
         real_data("Kalman", dtype)
+        one_number("r", self.r)
         return KalmanState(jnp.zeros(size, dtype), jnp.diag(per_weight("p0", self.p0, size, dtype)))
 
     def step(

@@ -12,15 +12,29 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Complex, Float
 
 from rotflex_jax.basis.bank import Bank
-from rotflex_jax.checks import whole
+from rotflex_jax.checks import entries, shown, whole
 from rotflex_jax.errors import InputError
 from rotflex_jax.recording.samples import sampling_period
 
 SectionKinds = tuple[str, ...]
 """Order of a section: "real" for one pole, "pair" for a conjugate pair."""
+
+
+def _listed(poles: Any, name: str, example: str) -> Complex[np.ndarray, " M"]:
+    """Poles that a user gives, one or several in a row, as finite numbers."""
+    try:
+        found = np.atleast_1d(np.asarray(poles if (several := entries(poles)) is None else several))
+    except ValueError:  # rows of different lengths
+        found = np.asarray(None)
+    if found.dtype.kind not in "iufc" or found.ndim != 1 or not found.size or not np.isfinite(found).all():
+        raise InputError(
+            f"Argument `{name}` must list finite numbers, at least one, but is {shown(poles)}; "
+            f"give for instance {example}."
+        )
+    return found.astype(complex)
 
 
 def sections(poles: Sequence[complex]) -> tuple[SectionKinds, Float[np.ndarray, " M"]]:
@@ -31,12 +45,7 @@ def sections(poles: Sequence[complex]) -> tuple[SectionKinds, Float[np.ndarray, 
     Raises:
         InputError: There are no poles, a pole is not inside the unit circle, or its conjugate is missing.
     """
-    given = np.atleast_1d(np.asarray(poles, complex))
-    if given.ndim != 1 or not given.size or not np.isfinite(given).all():
-        raise InputError(
-            f"Argument `poles` must list finite numbers, at least one, but is {poles!r}; "
-            "give for instance (0.5, 0.6 + 0.3j, 0.6 - 0.3j)."
-        )
+    given = _listed(poles, "poles", "(0.5, 0.6 + 0.3j, 0.6 - 0.3j)")
     outside = [p if p.imag else p.real for p in given.tolist() if abs(p) >= 1]
     if outside:
         raise InputError(
@@ -258,7 +267,7 @@ class Orthonormal(Bank):
         >>> Orthonormal.at([-10.0], 0.1).poles
         ((0.36787944117144233+0j),)
         """
-        s = np.atleast_1d(np.asarray(continuous_poles, complex))
+        s = _listed(continuous_poles, "continuous_poles", "(-10.0, -5 + 30j, -5 - 30j)")
         rising = [pole for pole in s.tolist() if pole.real >= 0]
         if rising:
             raise InputError(

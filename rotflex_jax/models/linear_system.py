@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Float, Inexact
 
 from rotflex_jax.recording import Recording
+from rotflex_jax.recording.recording import single
 from rotflex_jax.recording.samples import require_period
 
 
@@ -49,20 +50,22 @@ class LinearSystem:
         Raises:
             InputError: The recording has another sampling period, or lacks a signal.
         """
+        recording = single(recording)
         with np.errstate(all="ignore"):  # an unstable system overflows
             return self._run(recording, self.start(recording), np.zeros_like(self.K))
 
     def predict(self, recording: Recording) -> Float[np.ndarray, "N C"]:
         """One-step-ahead prediction of each sample from all samples before it; raises as `simulate` does."""
+        recording = single(recording)
         with np.errstate(all="ignore"):
             return self._run(recording, self.start(recording), self.K)
 
     def start(self, recording: Recording) -> Float[np.ndarray, " n"]:
         """First state, by least squares on the first `n_init` samples."""
+        recording = single(recording)
         require_period(self.Ts, recording.Ts, "The system holds")
         m = recording.n_init
-        head = recording.slice(0, m)
-        forced = self._run(head, np.zeros(self.order), np.zeros_like(self.K))
+        forced = self._run(recording, np.zeros(self.order), np.zeros_like(self.K), m)
         rows, power = [], np.eye(self.order)
         for _ in range(m):
             rows.append(self.C @ power)
@@ -75,13 +78,16 @@ class LinearSystem:
         scale = np.maximum(np.linalg.norm(O, axis=0), 1e-300)
         return np.linalg.lstsq(O / scale, y.ravel(), rcond=1e-3)[0] / scale
 
-    def _run(self, recording: Recording, x: np.ndarray, K: np.ndarray) -> np.ndarray:
+    def _run(
+        self, recording: Recording, x: np.ndarray, K: np.ndarray, samples: int | None = None
+    ) -> np.ndarray:
+        N = recording.N if samples is None else samples
         y = recording.y.astype(float)
-        u = np.column_stack([recording.inputs(self.signals).astype(float), np.ones(recording.N)])
+        u = np.column_stack([recording.inputs(self.signals)[:N].astype(float), np.ones(N)])
         forcing, through = u @ self.B.T, u @ self.D.T
-        out = np.empty((recording.N, len(self.C)))
+        out = np.empty((N, len(self.C)))
         correct = bool(K.any())
-        for k in range(recording.N):
+        for k in range(N):
             out[k] = self.C @ x + through[k]
             x = self.A @ x + forcing[k]
             if correct:

@@ -10,6 +10,7 @@ from rotflex_jax.basis import Basis
 from rotflex_jax.basis.bank import require_basis
 from rotflex_jax.errors import InputError
 from rotflex_jax.recording import Recording
+from rotflex_jax.recording.recording import single
 from rotflex_jax.recording.samples import require_period, sampling_period
 
 
@@ -71,7 +72,7 @@ class Series:
 
     def measured(self, recording: Recording) -> Float[np.ndarray, "N 1"]:
         """The measured channel."""
-        return recording.channel(self.channel)[:, None]
+        return single(recording).channel(self.channel)[:, None]
 
     def simulate(self, recording: Recording) -> Float[np.ndarray, "N 1"]:
         """Free run over a recording, from its input alone, in the precision of the recording.
@@ -79,6 +80,7 @@ class Series:
         Raises:
             InputError: The recording has another sampling period.
         """
+        recording = single(recording)
         require_period(self.Ts, recording.Ts, "The series holds")
         phi = self.basis.regressors(recording.u)
         return (phi @ self.weights.astype(phi.dtype))[:, None]
