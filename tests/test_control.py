@@ -468,3 +468,27 @@ def test_a_figure_has_units_on_each_axis():
     labels = [ax.get_ylabel() for ax in run.plot(run).axes]
     assert labels == ["hub [deg]", "error [deg]", "voltage [V]", "load at hub [N m]"]
     assert "Tracking error" in str(run) and "Controller of hub" in str(run.controller)
+
+
+def test_a_figure_names_each_run_and_how_many_more_there_are():
+    """The legend of an assessment has the names of its models, that of runs their compensation."""
+    controllers = [rf.controller(JOINT, TS, compensate=c) for c in ("nothing", "feedforward", "observer")]
+    first, *others = (close_loop(each, JOINT, swing(0.2, 0.1)) for each in controllers)
+
+    def legend(figure: Any) -> list[str]:
+        return [text.get_text() for text in figure.legends[0].get_texts()]
+
+    said = [f"compensation: {each.compensate}" for each in controllers]
+    assert legend(first.plot(*others)) == ["reference", *said]
+    two = rf.assess(controllers[0], {"light": JOINT, "rubbed": RUBBED}, np.zeros(50), hold=0.0)
+    assert legend(two.plot()) == ["reference", "light", "rubbed"]
+    many = {f"model {k}": JOINT for k in range(1, 9)}
+    names = legend(rf.assess(controllers[0], many, np.zeros(50), hold=0.0).plot())
+    assert names == ["reference", *(f"model {k}" for k in range(1, 7)), "2 more"]
+
+
+@pytest.mark.parametrize(("still", "said"), [(0.5, "limit cycle not looked for"), (1.5, "no limit cycle")])
+def test_a_limit_cycle_is_denied_only_where_it_was_looked_for(still: float, said: str):
+    made = rf.controller(JOINT, TS)
+    assert said in str(close_loop(made, JOINT, swing(0.2, still)))
+    assert said in rf.assess(made, [JOINT], swing(0.2, still), hold=0.0).sentence

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from rotflex_jax.checks import instance, number, seed as checked_seed, shown, whole
-from rotflex_jax.control.closed_loop import ClosedLoop, run_loop
+from rotflex_jax.control.closed_loop import NOT_LOOKED_FOR, ClosedLoop, run_loop
 from rotflex_jax.control.design import Controller
 from rotflex_jax.errors import InputError
 from rotflex_jax.fit import Fit
@@ -61,7 +61,8 @@ class ControlAssessment:
         error = "no bound" if not np.isfinite(rms) else f"{rms:.3g} {unit} rms"
         said = f"Worst case of {len(self.runs)} models: {error} with {worst}"
         if not self.broken:
-            return f"{said}; no limit cycle with any of them."
+            looked = all(run.rests for run in self.runs.values())
+            return f"{said}; {'no limit cycle with any of them' if looked else NOT_LOOKED_FOR}."
         return f"{said}; " + "; ".join(f"{name}: {what}" for name, what in self.broken.items()) + "."
 
     def to_dict(self) -> dict[str, Any]:
@@ -73,9 +74,10 @@ class ControlAssessment:
         }
 
     def plot(self) -> "Figure":
-        """Figure of all runs on common axes."""
-        first, *others = self.runs.values()
-        return first.plot(*others)
+        """Figure of all runs on common axes, with the names of the models."""
+        from rotflex_jax.control.figure import loop_figure  # loads matplotlib, so only on request
+
+        return loop_figure(tuple(self.runs.values()), tuple(self.runs))
 
     def _rows(self) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
         _, unit = readable(1.0, next(iter(self.runs.values())).unit)

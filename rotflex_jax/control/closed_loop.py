@@ -36,6 +36,9 @@ SETTLING_SHARE = 1 / 3
 SHORTEST_REST = 1.0
 """Least time at a constant reference for which a limit cycle is looked for [s]."""
 
+NOT_LOOKED_FOR = f"limit cycle not looked for, since the reference rests for less than {SHORTEST_REST:g} s"
+"""What a sentence says of a run whose reference moves until its end, or almost."""
+
 SUSTAINED = 0.9
 """An oscillation dies out if its size in the second half is below this share of its size in the first."""
 
@@ -126,6 +129,18 @@ class ClosedLoop:
         most = 1e3 * (1 + np.max(np.abs(self.motion.reference)))
         return bool(np.all(np.isfinite(self.position)) and np.max(np.abs(self.position)) < most)
 
+    @property
+    def _still(self) -> int:
+        """Number of samples at the end in which the reference is constant."""
+        r = self.motion.reference
+        moving = np.flatnonzero(r != r[-1])
+        return len(r) - (int(moving[-1]) + 1 if len(moving) else 0)
+
+    @property
+    def rests(self) -> bool:
+        """Whether the reference is constant at its end for long enough to look for a limit cycle."""
+        return self._still * self.controller.Ts >= SHORTEST_REST
+
     @functools.cached_property
     def limit_cycle(self) -> LimitCycle | None:
         """Sustained oscillation at the end of the run, while the reference is constant; None without one.
@@ -135,10 +150,8 @@ class ClosedLoop:
         twice. In the second half, the oscillation must be larger than the steps of the finest sensor and not
         clearly smaller than in the first half.
         """
-        Ts, r = self.controller.Ts, self.motion.reference
-        moving = np.flatnonzero(r != r[-1])
-        still = len(r) - (moving[-1] + 1 if len(moving) else 0)
-        if still * Ts < SHORTEST_REST or not self.bounded:
+        Ts, r, still = self.controller.Ts, self.motion.reference, self._still
+        if not self.rests or not self.bounded:
             return None
         tail = self.position[len(r) - round(still * (1 - SETTLING_SHARE)) :]
         halves = np.array_split(tail, 2)
@@ -173,7 +186,7 @@ class ClosedLoop:
         unit, cycle = self.unit, self.limit_cycle
         rms, shown_in = readable(self.rms, unit)
         worst, worst_in = readable(self.largest, unit)
-        ends = "no limit cycle"
+        ends = "no limit cycle" if self.rests else NOT_LOOKED_FOR
         if cycle is not None:
             size, size_in = readable(cycle.amplitude, unit)
             ends = f"limit cycle of {size:.3g} {size_in} at {cycle.frequency:.3g} Hz"
@@ -186,7 +199,8 @@ class ClosedLoop:
         """Figure of position, error, voltage and observed load over time, with other runs beside them."""
         from rotflex_jax.control.figure import loop_figure  # loads matplotlib, so only on request
 
-        return loop_figure(self, *others)
+        runs = (self, *others)
+        return loop_figure(runs, [f"compensation: {each.controller.compensate}" for each in runs])
 
 
 class _Gains(NamedTuple):
