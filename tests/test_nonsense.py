@@ -5,8 +5,9 @@ import math
 import re
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
+import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import pytest
@@ -524,7 +525,12 @@ BAD: dict[tuple[str, str], list[tuple[Any, str]]] = {
     ],
     ("Recording", "remarks"): [(3, "list of findings, but has 3"), ("ab", "has 'ab'"), ([1], "has 1")],
     ("Recording", "continues"): [(3, "the recording before this one, but is 3")],
-    ("Recording", "constants"): [(3, "is 3"), ({"a": NAN}, "the value nan")],
+    ("Recording", "constants"): [
+        (3, "is 3"),
+        ({"a": NAN}, "the value nan"),
+        ({"a": True}, "the value True"),
+        ({"a": np.ones(1)}, "the value a ndarray"),
+    ],
     ("Recording", "signals"): [
         (3, "by its name, but is 3"),
         ({"": U}, "the name ''"),
@@ -781,3 +787,39 @@ def test_what_no_float_can_hold_is_refused():
         rf.effects.Coulomb("hub", level=10**400)
     with pytest.raises(rf.InputError, match="list of degrees, but is True"):
         basis.Volterra(basis.Delays(3), degrees=True)
+
+
+@pytest.mark.parametrize(
+    ("value", "shown"),
+    [
+        (True, "True"),
+        ("2", "'2'"),
+        (b"2", "a bytes"),
+        (2 + 0j, r".2.0j."),
+        ([2.0], "a list"),
+        (np.array([2.0]), "a ndarray"),
+        (np.array("2"), "'2'"),
+        (np.ma.masked, "a MaskedConstant"),
+    ],
+)
+def test_a_parameter_that_is_no_number_is_refused(value: Any, shown: str) -> None:
+    with pytest.raises(rf.InputError, match=f"level={shown}, but it needs a number in N m; give one"):
+        rf.effects.Coulomb(at="hub", level=value)
+
+
+def test_an_array_of_no_axis_is_a_number() -> None:
+    made = rf.effects.Coulomb(at="hub", level=cast(Any, np.array(0.25)))
+    assert made == rf.effects.Coulomb(at="hub", level=0.25) and hash(made) == hash(made.replace(level=0.25))
+    with pytest.raises(rf.InputError, match=r"level=-0.25 N m, but it needs a finite value"):
+        rf.effects.Coulomb(at="hub", level=cast(Any, np.array(-0.25)))
+    known = {"a": np.float32(0.25), "b": np.array(0.25), "c": jnp.float32(0.25)}
+    found = rf.Recording(u=U, y=Y, Ts=0.01, accept=("units",), constants=cast(Any, known)).constants
+    assert set(found.values()) == {0.25} and all(type(value) is float for value in found.values())
+
+
+def test_a_series_of_pandas_is_no_vector_of_values() -> None:
+    """Its rows may have another order than the parameters."""
+    values = pd.Series(dict(zip(JOINT.parameter_names, JOINT.values, strict=True)))[::-1]
+    with pytest.raises(rf.InputError, match=r"`values` must have one number for each .* is a Series"):
+        JOINT.with_values(cast(Any, values))
+    assert JOINT.with_values(values.to_dict()) == JOINT

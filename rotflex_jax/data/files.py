@@ -52,7 +52,7 @@ from rotflex_jax.recording import Recording
 from rotflex_jax.recording.quality import DOUBTED, SLOWEST_SAMPLING, Finding, acceptable, converted
 from rotflex_jax.recording.recording import single
 from rotflex_jax.recording.samples import real_numbers
-from rotflex_jax.text.files import write_file
+from rotflex_jax.text.files import path_of, write_file
 
 READERS: dict[str, Callable[[Path, int], Table]] = {
     ".csv": table_from_text,
@@ -458,14 +458,14 @@ def save_csv(recording: Recording, path: str | os.PathLike[str]) -> Path:
         InputError: the file cannot be written, or two columns would have one name; an existing file then
             stays as it is.
     """
-    recording = single(recording, "recording")
+    recording, path = single(recording, "recording"), path_of(path)
     columns = np.column_stack([recording.t, recording.u, recording.y, *recording.signals.values()])
     # 17 digits represent a number exactly; the time is known to fewer digits.
     formats = ["%.15g"] + ["%.17g"] * (columns.shape[1] - 1)
     outputs = zip(recording.channels, recording.units, strict=True)
     header = ["t", column_title(recording.input_name, recording.input_unit, "V")]
     header += [*(column_title(name, unit, "rad") for name, unit in outputs), *recording.signals]
-    csv.writer(text := StringIO(), lineterminator="\n").writerow(distinct(header, Path(path).name))
+    csv.writer(text := StringIO(), lineterminator="\n").writerow(distinct(header, path.name))
     np.savetxt(text, columns, fmt=formats, delimiter=",")
     return write_file(path, text.getvalue())
 

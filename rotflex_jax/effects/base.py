@@ -37,6 +37,8 @@ Domain = Literal["port", "input", "channel", "signal"]
 Beside = Literal["nothing", "other", "states"]
 StatePart = Literal["linear", "rotor", "memory"]
 EffectType = TypeVar("EffectType", bound="Effect")
+# Values that are no number, though some could be turned into one. Other types may be traced or symbolic.
+_NO_NUMBERS = (str, bytes, bool, np.bool_, complex, list, tuple, dict, np.ndarray, type(None))
 # Separator of a port and the signal that drives an effect there.
 _SIGNAL_MARK = ": "
 
@@ -230,9 +232,12 @@ class Effect(abc.ABC):
             value = getattr(self, name)
             if value is None and getattr(type(self), name) is None:
                 continue  # an optional part that the instance does not have
-            if value is None or isinstance(value, str):
+            if isinstance(value, np.ndarray) and value.ndim == 0:
+                value = value[()]  # an array has no hash, a number has one
+                object.__setattr__(self, name, value)
+            if isinstance(value, _NO_NUMBERS):
                 raise InputError(
-                    f"{kind} was given {name}={value!r}, but it needs a number"
+                    f"{kind} was given {name}={shown(value)}, but it needs a number"
                     f"{f' in {spec.unit}' if spec.unit else ''}; give one."
                 )
             if isinstance(value, jax.Array) or not isinstance(value, numbers.Real):

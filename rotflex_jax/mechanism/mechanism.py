@@ -439,7 +439,8 @@ class Mechanism:
                 if own != old[name] and own != values.get(self.followers[name]):
                     self._refuse_follower(name)
             values = list((old | dict(values)).values())
-        sized = hasattr(values, "__len__") and getattr(values, "ndim", 1) > 0
+        # Of a table with names, such as a Series of pandas, the order might be another one.
+        sized = isinstance(values, Sequence | np.ndarray | jax.Array) and getattr(values, "ndim", 1) > 0
         sized = sized and not (isinstance(values, np.ndarray) and values.ndim > 1)
         if not sized or len(values) != len(self.parameter_names):
             raise InputError(

@@ -1,7 +1,6 @@
 """Checks of samples: real, finite, aligned, evenly spaced; sampling period and initial samples."""
 
 import math
-import numbers
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
@@ -295,13 +294,14 @@ def known_constants(given: Mapping[str, float] | None) -> Mapping[str, float]:
             "instance constants={'hub.position_servo.gain': 400.0}."
         )
     for name, value in (given or {}).items():
-        if not isinstance(name, str) or not isinstance(value, numbers.Real) or not math.isfinite(value):
+        number = real(value)
+        if not isinstance(name, str) or not math.isfinite(number):
             raise InputError(
-                f"The recording was given the constant {name!r} with the value {value!r}, but it needs the "
-                "full name of a parameter and a finite number; write for instance "
+                f"The recording was given the constant {shown(name)} with the value {shown(value)}, but it "
+                "needs the full name of a parameter and a finite number; write for instance "
                 "constants={'hub.position_servo.gain': 400.0}."
             )
-        found[name] = float(value)
+        found[name] = number
     return found
 
 
