@@ -285,7 +285,7 @@ def signal(u: Any, name: str = "u") -> Float[np.ndarray, " N"]:
     """A signal as an array: float32 if it was given in single or half precision, else float64.
 
     Raises:
-        InputError: The signal has more than one column, is complex or empty, or is not finite.
+        InputError: The signal has more than one column, is complex or empty, is masked, or is not finite.
     """
     try:
         array = np.asarray(u)
@@ -297,6 +297,8 @@ def signal(u: Any, name: str = "u") -> Float[np.ndarray, " N"]:
             f"Argument `{name}` must be real numbers of shape (N,), one per sample, but is {what}; "
             "give one signal."
         )
+    if np.ma.is_masked(u):  # an array that is made of it has the numbers below the mask
+        raise InputError(f"Argument `{name}` has masked samples, but all are needed; cut or refill them.")
     if not all_finite(array):
         k = int(np.argmin(np.isfinite(array)))
         raise InputError(

@@ -63,6 +63,10 @@ def _score(
             "The measured and the modelled output must be arrays of numbers, time first, but are "
             f"{shown(y)} and {shown(y_hat)}; give what was recorded and simulated."
         )
+    if np.ma.is_masked(y) or np.ma.is_masked(y_hat):
+        raise InputError(
+            "The measured or the modelled output has masked samples, but all are scored; cut them from both."
+        )
     if measured.shape != modelled.shape:
         raise InputError(
             f"The measured and the modelled output must have the same shape, but have "

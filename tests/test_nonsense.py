@@ -823,3 +823,13 @@ def test_a_series_of_pandas_is_no_vector_of_values() -> None:
     with pytest.raises(rf.InputError, match=r"`values` must have one number for each .* is a Series"):
         JOINT.with_values(cast(Any, values))
     assert JOINT.with_values(values.to_dict()) == JOINT
+
+
+def test_masked_samples_are_not_used() -> None:
+    masked = np.ma.masked_greater(U, 0.0)
+    with pytest.raises(rf.InputError, match="`u` has masked samples, but all are needed"):
+        rf.simulate(JOINT, masked, 0.002)
+    for pair in ((masked, U), (U, masked)):
+        with pytest.raises(rf.InputError, match="has masked samples, but all are scored"):
+            metrics.rmse(*pair)
+    assert metrics.rmse(np.ma.array(U), 0 * U) == pytest.approx(np.sqrt(np.mean(U**2)))
