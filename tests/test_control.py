@@ -281,7 +281,7 @@ def test_the_assessment_names_the_model_that_breaks_the_loop():
 
 def test_the_worst_model_has_the_largest_mean_square_error():
     """Not the largest error, which a single moment may have. Errors are shown in degrees, shares in %."""
-    run = functools.partial(SimpleNamespace, unit="rad", bounded=True, limit_cycle=None)
+    run = functools.partial(SimpleNamespace, unit="rad", bounded=True, limit_cycle=None, rests=True)
     report = ControlAssessment(
         None,
         {"a": run(rms=0.02, largest=0.03, saturated=0.25), "b": run(rms=0.01, largest=0.1, saturated=0.0)},
