@@ -68,9 +68,7 @@ def search(A: rf.Recording, B: rf.Recording) -> dict:
 def fits(A: rf.Recording, B: rf.Recording) -> dict:
     """Structures of `fine_run`, fitted to one run or to both, and evaluated on each run."""
     runs, out = {"A": A, "B": B}, {}
-    print(
-        "\n| structure | from | judged on | no offset | its own offset | whole, its own offset | offset [V] |"
-    )
+    print("\n| structure | from | evaluated on | no offset | its offset | whole, its offset | offset [V] |")
     print("|---|---|---|---|---|---|---|")
     for name, free in fine_run.STRUCTURES.items():
         lugre = "presliding" in free
@@ -93,7 +91,7 @@ def fits(A: rf.Recording, B: rf.Recording) -> dict:
                 )
                 kind = "" if key not in learnt else " (seen)"
                 print(f"| {name} | {learnt} | {key}{kind} | {errors} | {own['offset']:+.4f} |", flush=True)
-            out[f"{name}, from {learnt}"] = {"judged": rows, "numbers": found.numbers, "std": found.std}
+            out[f"{name}, from {learnt}"] = {"evaluated": rows, "numbers": found.numbers, "std": found.std}
     return out
 
 
@@ -137,7 +135,7 @@ def arm(A: rf.Recording, B: rf.Recording) -> dict:
 
 def play(A: rf.Recording, B: rf.Recording) -> dict:
     """Structures with play in the gear."""
-    print("\n| structure | learnt from, judged on | no offset | its offset | whole 10 s, its offset |")
+    print("\n| structure | learnt from, evaluated on | no offset | its offset | whole 10 s, its offset |")
     print("|---|---|---|---|---|")
     return with_play.compare(A, B)
 

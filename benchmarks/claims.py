@@ -239,7 +239,7 @@ def joint_noise() -> str:
 def joint_fitted_freely() -> str:
     """Errors of short free runs over B of LuGre friction and hysteresis, fitted to free runs over A [deg]."""
     found = results("B1.json")["fits"]["LuGre at the hub, Bouc-Wen at the joint, from A"]
-    return " / ".join(f"{e:.2f}" for e in found["judged"]["B"]["no_offset"])
+    return " / ".join(f"{e:.2f}" for e in found["evaluated"]["B"]["no_offset"])
 
 
 @named
@@ -247,7 +247,7 @@ def joint_theta_fall() -> str:
     """Factor by which Coulomb friction fitted to run A reduces the short-run error of theta over run B."""
     found = results("B1.json")
     before = math.degrees(found["search"]["A to B"]["baseline"]["held_out_rmse_windows"]["theta"])
-    after = found["fits"]["Coulomb at the hub, from A"]["judged"]["B"]["no_offset"][0]
+    after = found["fits"]["Coulomb at the hub, from A"]["evaluated"]["B"]["no_offset"][0]
     return f"{before / after:.1f}"
 
 

@@ -343,7 +343,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=21)
     parser.add_argument("--only", default="", help="part of an area or of the name of a module")
     parser.add_argument("--again", action="store_true", help="run survivors once more")
-    parser.add_argument("--fresh", action="store_true", help="begin the store anew")
+    parser.add_argument("--fresh", action="store_true", help="start a new store")
     parser.add_argument(
         "--workers", type=int, default=1, help="copies of the tree, each on a core of its own"
     )

@@ -97,10 +97,10 @@ def main() -> int:
         print(f"fitted to all: {calibrated(rows)}")
         halves = [rows[0::2], rows[1::2]]
         shown = []
-        for fitted, judged in itertools.permutations(halves):
+        for fitted, evaluated in itertools.permutations(halves):
             rule = calibrated(fitted)
             print(f"fitted to one half: {rule}")
-            shown += [again(r, rule) for r in judged]
+            shown += [again(r, rule) for r in evaluated]
         print("each half by the rule of the other:")
         print(summary(shown))
     if a.figure:

@@ -129,8 +129,8 @@ def test_windows_start_again() -> None:
     model = Model(rf.joints.paper())
     # The last 0.1 s belong to the second window. First states are estimated in each window separately.
     windowed = [model.simulate(test.slice(i, j)) for i, j in ((0, 500), (500, 1050))]
-    judged = np.r_[100:500, 600:1050]
-    expected = np.sqrt(np.mean((np.concatenate(windowed) - test.y)[judged] ** 2, axis=0))
+    evaluated = np.r_[100:500, 600:1050]
+    expected = np.sqrt(np.mean((np.concatenate(windowed) - test.y)[evaluated] ** 2, axis=0))
     assert list(row.rmse_windows.values()) == pytest.approx(expected.tolist())
     assert row.rmse_windows["theta"] < row.rmse["theta"]
 

@@ -26,7 +26,7 @@ SETTINGS = {
         "10": "length of the recordings [s]",
         "2": "length of the windows [s], a setting",
         "7": "seconds to learn from, the split",
-        "3": "seconds to judge on, the split",
+        "3": "seconds of the test, the split",
         "20": "step of the arena [µs], in its documentation",
     },
 }

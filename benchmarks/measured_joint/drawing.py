@@ -67,7 +67,7 @@ def errors(fits: dict) -> Figure:
     for column, (ax, channel) in enumerate(zip(axes, ("hub angle", "deflection"), strict=True)):
         for row, name in enumerate(names):
             for shift, (learnt, other) in ((-0.16, ("A", "B")), (0.16, ("B", "A"))):
-                seen, unseen = (fits[f"{name}, from {k}"]["judged"][other] for k in (other, learnt))
+                seen, unseen = (fits[f"{name}, from {k}"]["evaluated"][other] for k in (other, learnt))
                 values = (unseen["no_offset"], unseen["own_offset"], seen["own_offset"])
                 for (label, (mark, edge, face)), value in zip(marks.items(), values, strict=True):
                     ax.plot(

@@ -118,21 +118,21 @@ def compare(A: rf.Recording, B: rf.Recording) -> dict:
         lugre = "presliding" in free
         for learnt in runs:
             found = fit(runs[learnt], (*free, *fine_run.OWN), lugre)
-            judged = {}
+            evaluated = {}
             for key, run in runs.items():
                 bare = found | {"offset": 0.0, "bias": 0.0}
                 own = found if key == learnt else fit(run, ("offset",), lugre, bare)
-                judged[key] = {
+                evaluated[key] = {
                     "no_offset": rms(bare, lugre, run, law=LAW),
                     "own_offset": rms(own, lugre, run, law=LAW),
                     "offset": own["offset"],
                     "whole": rms(own, lugre, run, run.N, LAW),
                 }
                 errors = " | ".join(
-                    " / ".join(f"{e:.2f}" for e in judged[key][k])
+                    " / ".join(f"{e:.2f}" for e in evaluated[key][k])
                     for k in ("no_offset", "own_offset", "whole")
                 )
                 seen = "" if key != learnt else " (bound)"
                 print(f"| {name} | {learnt}, {key}{seen} | {errors} |", flush=True)
-            out[f"{name}, from {learnt}"] = {"judged": judged, "numbers": found}
+            out[f"{name}, from {learnt}"] = {"evaluated": evaluated, "numbers": found}
     return out

@@ -25,7 +25,9 @@ CUTOFF = 5.0
 def blocks(quick: bool, say: Callable[[str], None]) -> Iterator[Block]:
     """The parts of the table."""
     N, records = (2000, 2) if quick else (15_000, 6)
-    about = f"Least squares on {N} samples (5 Hz), judged on {N} others; mean of {records} pairs of records."
+    about = (
+        f"Least squares on {N} samples (5 Hz), evaluated on {N} others; mean of {records} pairs of records."
+    )
     yield by_degree(N, records, about, say)
     yield springs(N, records, about, say)
     say("significance")
@@ -140,7 +142,7 @@ def five_functions(N: int, records: int) -> Block:
     mean, spread = mean_and_spread(values)
     return Block(
         "Five functions, S1, 20 ms",
-        f"Least squares on {N} samples (5 Hz), judged on {N} others; mean of {records} pairs of records. "
+        f"Least squares on {N} samples (5 Hz), evaluated on {N} others; mean of {records} pairs of records. "
         "One real pole and two pairs, optimised for the degrees 1 and 3 together: for degree 1 alone the "
         "second pair is of no use, and where it then comes to rest the cubic model has 0.0083.",
         ("degree 1", "degree 2", "degree 3"),

@@ -12,7 +12,7 @@ from rotflex_jax.basis import Delays, Volterra
 from seed_paper.blocks import Block, mean_and_spread
 from seed_paper.records import deflection, nmse, record, voltage
 
-TITLE = "Facts that decide how such models are judged"
+TITLE = "Facts that decide how such models are evaluated"
 MU1, MU2 = 0.004, 1e-4
 
 

@@ -100,7 +100,7 @@ def with_friction(quick: bool) -> Block:
         rows[name], spread[name] = mean_and_spread(values)
     return Block(
         "NMSE of five delays with friction (S1, 5 Hz)",
-        f"Least squares on {N} samples, judged on as many others; mean of {records} pairs of records.",
+        f"Least squares on {N} samples, evaluated on as many others; mean of {records} pairs of records.",
         ("least squares",),
         rows,
         spread,

@@ -94,7 +94,7 @@ def under_friction(quick: bool, poles: tuple[complex, ...]) -> Iterator[Block]:
             real, pair = sorted(bank.continuous_poles(Ts), key=lambda s: s.imag)[1:]
             values.append([real.real, pair.real, pair.imag])
             if scenario == "S1":
-                errors.append([judged(b, (u, y), (v, z), Ts) for b in (Orthonormal.at(poles, Ts), bank)])
+                errors.append([test_nmse(b, (u, y), (v, z), Ts) for b in (Orthonormal.at(poles, Ts), bank)])
         rows[scenario], spread[scenario] = mean_and_spread(values)
     about = (
         f"Three poles fitted to {N} samples (5 Hz) with the weights projected out; mean of {records} records."
@@ -119,7 +119,7 @@ def under_friction(quick: bool, poles: tuple[complex, ...]) -> Iterator[Block]:
     )
 
 
-def judged(bank: Orthonormal, train: tuple, test: tuple, Ts: float) -> float:
+def test_nmse(bank: Orthonormal, train: tuple, test: tuple, Ts: float) -> float:
     """NMSE of a linear fit on a second recording."""
     recordings = [Recording(u=u, y=y, Ts=Ts, channels="alpha") for u, y in (train, test)]
     fit = least_squares(Volterra(bank, order=1), recordings[0], "alpha")

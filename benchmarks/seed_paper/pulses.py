@@ -25,7 +25,7 @@ def blocks(quick: bool, say: Callable[[str], None]) -> Iterator[Block]:
     yield truth()
     yield in_short()
     N, records = (2000, 2) if quick else (15_000, 4)
-    about = f"Fitted to {N} samples (5 Hz), judged on the pulse; mean of {records} records."
+    about = f"Fitted to {N} samples (5 Hz), evaluated on the pulse; mean of {records} records."
     yield symmetric(N, records, about, say)
     yield ringing(N, records)
     yield others(N, records, about, say)

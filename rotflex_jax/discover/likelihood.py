@@ -3,8 +3,8 @@
 A search uses two horizons. A one-step prediction uses every sample. But where another part of the model is
 wrong, its state follows the data within a few samples, and slow effects are no longer visible. A free run
 over a few seconds shows slow effects. It is a predictor with gain zero that starts again at each window. Its
-errors are correlated from sample to sample, although its likelihood assumes independent errors. So its gains
-are judged by their scatter between blocks of time.
+errors are correlated from sample to sample, although its likelihood assumes independent errors. So the
+significance of its gains follows from their scatter between blocks of time.
 """
 
 import dataclasses
