@@ -127,6 +127,8 @@ def test_traced_values_are_refused_where_numbers_are_needed(use: Callable[[Mecha
     joint = paper()
     with pytest.raises(InputError, match=r"values that JAX traces.* use rotflex_jax\.mechanism\.free_run"):
         jax.jit(lambda joint: use(joint) and None)(joint)
+    with pytest.raises(InputError, match=r"JAX traces `u`.* use rotflex_jax\.mechanism\.free_run"):
+        jax.jit(lambda u: simulate(joint, u, 0.01))(noise(60))
 
 
 def last_deflection(joint: Mechanism) -> jax.Array:

@@ -355,6 +355,11 @@ def _simulated(run, mechanism, u, Ts, x0, solver):  # noqa: ANN001, ANN202 - typ
 def _input(mechanism: Mechanism, u: Any) -> Float[np.ndarray, "N *c"]:
     """The voltage, with the signals beside it if the mechanism takes signals; checked."""
     names = mechanism.signals
+    if isinstance(u, jax.core.Tracer):
+        raise InputError(
+            "JAX traces `u`, but its samples are needed here; inside of jax.jit or jax.grad use "
+            "rotflex_jax.mechanism.free_run, or give numbers."
+        )
     if not names:
         return signal(u)
     if np.shape(u)[1:] == (1 + len(names),):
