@@ -129,7 +129,7 @@ def test_columns_of_a_simulation_are_no_formulas(tmp_path: Path) -> None:
         input_name="@u",
         accept=("saturated",),
     )
-    save_simulation(tmp_path / "run.csv", recording, {"y": recording.u})
+    save_simulation(tmp_path / "run.csv", recording, {'=1,"2"': recording.u})
     (head, *rows) = csv.reader((tmp_path / "run.csv").read_text().splitlines())
-    assert head == ["t", "'@u", '\'=1,"2"', "y_simulated"]
+    assert head == ["t", "'@u", '\'=1,"2"', '\'=1,"2"_simulated']
     assert {len(row) for row in rows} == {4} and len(rows) == 60
