@@ -410,7 +410,10 @@ def test_a_signal_that_drives_the_model_is_read_by_its_name(run, pushed, recorde
             (recorded,),
             f"has no column {BASE!r}; it has t, voltage, theta, alpha: name the right one with --signal",
         ),
-        ((pushed, "--signal", "i2"), f"--signal names 'i2'; name its column, --signal \"{BASE}=COLUMN\""),
+        (
+            (pushed, "--signal", "i2"),
+            f"signals that were read are 'i2'; name its column, --signal \"{BASE}=COLUMN\"",
+        ),
     ):
         status, out, err = run("simulate", *refused, "--joint", file)
         assert (status, out) == (2, "")
