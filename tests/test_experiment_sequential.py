@@ -284,8 +284,10 @@ def test_it_goes_on_while_lucky_noise_may_decide(side: float, stops: bool):
     settings = SimpleNamespace(error=0.01, segment_seconds=2.0)
     state = SimpleNamespace(settings=settings, seconds=4.0)
     rivals = SimpleNamespace(count=2, labels=("a", "b"))
-    choice: Any = SimpleNamespace(p=np.array([0.5, 0.5]), e=state, r=rivals)
-    reason = SegmentChoice._too_small(choice, evidence, 3.0, 20, ("noise", "5 Hz"))
+    needed = np.full((2, 2), np.log(99))
+    choice: Any = SimpleNamespace(p=np.array([0.5, 0.5]), e=state, r=rivals, needed=needed)
+    best: Any = SimpleNamespace(kind="noise", words="5 Hz")
+    reason = SegmentChoice._too_small(choice, evidence, 3.0, best)
     assert bool(reason) is stops and ("4.6 are needed" in reason) is stops
 
 
