@@ -7,6 +7,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Integer, Real
 
@@ -355,7 +356,7 @@ def _simulated(run, mechanism, u, Ts, x0, solver):  # noqa: ANN001, ANN202 - typ
 def _input(mechanism: Mechanism, u: Any) -> Float[np.ndarray, "N *c"]:
     """The voltage, with the signals beside it if the mechanism takes signals; checked."""
     names = mechanism.signals
-    if isinstance(u, jax.core.Tracer):
+    if isinstance(u, Tracer):
         raise InputError(
             "JAX traces `u`, but its samples are needed here; inside of jax.jit or jax.grad use "
             "rotflex_jax.mechanism.free_run, or give numbers."
