@@ -125,8 +125,8 @@ def discover(
     share = given.check_split(split, held_out or [])
     unseen = [*(held_out or []), *(test or [])]
     given.check_distinct(files, unseen)
-    given.check_overwritten([*files, *unseen, *([resume] if resume else [])], [json_file, save_model])
-    given.check_writable(save_model, or_stdout=json_file, folder=report)
+    read = [*files, *unseen, *([resume] if resume else [])]
+    given.check_writable(save_model, or_stdout=json_file, folder=report, read=read)
     model, columns = columns.of(by_name.model(joint_for(files, given.one_model(joints), columns)))
     if each:
         search_each(model, files, columns, share, report, json_file, scheduler, workers, calibrate)
@@ -155,8 +155,7 @@ def compare(
     """Compare methods on the same data by their free runs over held-out data."""
     share = given.check_split(split, held_out or [])
     given.check_distinct(files, held_out or [])
-    given.check_overwritten([*files, *(held_out or [])], [json_file])
-    given.check_writable(or_stdout=json_file, folder=report)
+    given.check_writable(or_stdout=json_file, folder=report, read=[*files, *(held_out or [])])
     if quick and methods is not None:
         raise InputError(
             "Options --quick and --methods were both given, but each says which methods to run; give one."

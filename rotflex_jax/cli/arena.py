@@ -20,8 +20,8 @@ def arena(
     json_file: given.JsonFile = None,
 ) -> None:
     """Score methods, your own or the arena's, on records whose truth none of them sees."""
-    given.check_overwritten([Path(m.partition(":")[0]) for m in methods or []], [report, json_file])
-    given.check_writable(report, or_stdout=json_file)
+    own = [Path(m.partition(":")[0]) for m in methods or []]
+    given.check_writable(report, or_stdout=json_file, read=own)
     optional("numba", "The simulator of the arena")
     from rotflex_jax.arena.entrants import ENTRANTS
 

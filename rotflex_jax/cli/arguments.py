@@ -405,21 +405,6 @@ def check_distinct(files: Sequence[Path], held_out: Sequence[Path]) -> None:
         seen[place] = file
 
 
-def check_overwritten(read: Sequence[Path], written: Sequence[Path | None]) -> None:
-    """Refuse an output file that would replace a file that is read, or another output."""
-    taken = {os.path.realpath(file) for file in read}
-    for file in written:
-        if file in (None, STDOUT):
-            continue
-        place = os.path.realpath(file)
-        if place in taken:
-            raise InputError(
-                f"An output would be written over {file}, which this command reads or writes already; name "
-                "another file for it."
-            )
-        taken.add(place)
-
-
 def check_split(split: float | None, held_out: Sequence[Path]) -> float:
     """The share of each file to fit."""
     if split is None:
@@ -437,19 +422,32 @@ def check_split(split: float | None, held_out: Sequence[Path]) -> float:
     return split
 
 
-def check_writable(*files: Path | None, or_stdout: Path | None = None, folder: Path | None = None) -> None:
-    """Refuse an output file or folder that cannot be written, before anything is computed.
+def check_writable(
+    *files: Path | None,
+    or_stdout: Path | None = None,
+    folder: Path | None = None,
+    read: Sequence[Path] = (),
+) -> None:
+    """Refuse outputs that cannot be written or would replace another file, before anything is computed.
 
     Args:
         files: Output files.
         or_stdout: Output file that may be `STDOUT`.
         folder: Output folder.
+        read: Files that the command reads.
     """
     if STDOUT in files:
         raise InputError("A file was given as -, but only --json goes to stdout; name the file.")
+    taken = {os.path.realpath(file) for file in read}
     for file in (*files, or_stdout):
         if file in (None, STDOUT):
             continue
+        if (place := os.path.realpath(file)) in taken:
+            raise InputError(
+                f"An output would be written over {file}, which this command reads or writes already; name "
+                "another file for it."
+            )
+        taken.add(place)
         if file.is_dir():
             raise InputError(f"{file} is a folder, but a file is written; name the file.")
         if not file.absolute().parent.is_dir():

@@ -90,8 +90,7 @@ def experiment(
             "--error or --max-seconds was given, but an experiment stops by itself with --state only; add it."
         )
     given.check_distinct(fit, [])
-    given.check_overwritten(fit, [save, plot, json_file, state])
-    given.check_writable(save, plot, state, or_stdout=json_file)
+    given.check_writable(save, plot, state, or_stdout=json_file, read=fit)
     if state is not None:
         if plot is not None or seconds != 20.0:
             raise InputError(
@@ -211,8 +210,7 @@ def _continued(
             "--continue was given with an option of the first command (as --fit, --between, --voltage or "
             "--travel), but the state has these; leave them out."
         )
-    given.check_overwritten([state, recording], [save, json_file])
-    given.check_writable(save, or_stdout=json_file)
+    given.check_writable(save, or_stdout=json_file, read=[state, recording])
     e = SequentialExperiment.load(state)
     if e.verdict:
         raise InputError(f"{state} has ended ({e.verdict}); begin another experiment with --state.")
@@ -280,22 +278,27 @@ def _limits(model: Any, voltage: float, slew: float, travel: float, deflection: 
     from rotflex_jax.models.model import Model
 
     units = output_units(Model.of(model).mechanism)
-    if len(units) == 1 and deflection != math.inf:
+    first, *others = units.values()
+    if not others and deflection != math.inf:
         raise InputError(
             f"--deflection {deflection:g} was given, but the model has one output, {', '.join(units)}; limit "
             "it with --travel."
         )
-    found = [math.inf, math.inf]
-    given_limits = (("--travel", travel), ("--deflection", deflection))
-    for i, ((option, value), unit) in enumerate(zip(given_limits, units.values(), strict=False)):
-        of_one, shown = as_read(1.0, unit)  # degrees per radian, millimetres per metre
-        if not value > 0:
-            raise InputError(
-                f"{option} was given {value:g}, but needs a positive number in {shown}; give what the "
-                "machine bears."
-            )
-        found[i] = value / of_one
-    return Limits(voltage, slew, *found)
+    travel = _in_unit("--travel", travel, first)
+    if others:
+        deflection = _in_unit("--deflection", deflection, others[0])
+    return Limits(voltage, slew, travel, deflection)
+
+
+def _in_unit(option: str, value: float, unit: str) -> float:
+    """The value of an option, given in degrees or millimetres, in the unit of an output."""
+    of_one, shown = as_read(1.0, unit)
+    if not value > 0:
+        raise InputError(
+            f"{option} was given {value:g}, but needs a positive number in {shown}; give what the machine "
+            "bears."
+        )
+    return value / of_one
 
 
 def _check_length(seconds: float, Ts: float) -> None:

@@ -26,8 +26,7 @@ def simulate(
 ) -> None:
     """Simulate a recording in free run and compare with what was measured."""
     given.check_distinct([file], fit or [])
-    given.check_overwritten([file, *(fit or [])], [save, save_model])
-    given.check_writable(save, save_model, folder=report)
+    given.check_writable(save, save_model, folder=report, read=[file, *(fit or [])])
     model = by_name.model(given.one_model(joints), add or ())
     model, columns = columns.of(model)
     recording = columns.load(file)
@@ -97,8 +96,7 @@ def export(
     for option, forms_with in USED_IN.items():
         if given.was_given(context, option) and form not in forms_with:
             raise InputError(f"--{option} was given, but {form} has no use of it; leave it out.")
-    given.check_overwritten([Path(model.partition(":")[0])], [out])
-    given.check_writable(or_stdout=out)
+    given.check_writable(or_stdout=out, read=[Path(model.partition(":")[0])])
     if form == "fmu" and out in (None, given.STDOUT):
         raise InputError("An FMU is an archive, which is not shown as text; give --out FILE.fmu.")
     from rotflex_jax import export as forms

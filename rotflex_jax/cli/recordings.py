@@ -189,25 +189,24 @@ def reads_files(command: Command) -> Command:
 
     It also imports the files of `--with`, since a saved model and a search may have effects of the user.
     """
-    reading = {f.name: f for f in dataclasses.fields(Columns) if f.name != "mechanism"}
-    types = {name: f.type for name, f in reading.items()} | {"effects": OwnEffects}
-    defaults = {name: f.default for name, f in reading.items()} | {"effects": None}
+    reading = [f for f in dataclasses.fields(Columns) if f.name != "mechanism"]
 
     @functools.wraps(command)
     def inside(**arguments: Any) -> None:
         for file in arguments.pop("effects") or []:
             imported(file)
-        command(columns=Columns(**{name: arguments.pop(name) for name in reading}), **arguments)
+        command(columns=Columns(**{f.name: arguments.pop(f.name) for f in reading}), **arguments)
 
     own = inspect.signature(command, eval_str=True)
     before = [p for p in own.parameters.values() if p.name != "columns"]
+    options = [(f.name, f.type, f.default) for f in reading] + [("effects", OwnEffects, None)]
     added = [
-        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=defaults[name], annotation=type_)
-        for name, type_ in types.items()
+        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=type_)
+        for name, type_, default in options
     ]
     listed = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in before] + added
     inside.__signature__ = own.replace(parameters=listed)  # pyright: ignore[reportAttributeAccessIssue]
-    inside.__annotations__ = {p.name: p.annotation for p in before} | types | {"return": None}
+    inside.__annotations__ = {p.name: p.annotation for p in listed} | {"return": None}
     del inside.__wrapped__  # pyright: ignore[reportAttributeAccessIssue]
     return inside
 

@@ -47,8 +47,8 @@ def reproduce(
         raise InputError(
             "--signal was given, but the experiment of the paper has its input alone; leave it out."
         )
-    given.check_overwritten([*map(Path, data or []), *(held_out or [])], [json_file])
-    given.check_writable(or_stdout=json_file, folder=out)
+    read = [*map(Path, data or []), *(held_out or [])]
+    given.check_writable(or_stdout=json_file, folder=out, read=read)
     joint = given.one_model(joints)
     mechanism = by_name.joint(joint)
     parts = _recordings(columns, data or [], held_out or [], split, joints)
