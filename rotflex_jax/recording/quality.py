@@ -42,20 +42,23 @@ def quantisation_step(x: Float[np.ndarray, " N"]) -> float | None:
     """
     arithmetic = 16 * np.finfo(x.dtype).eps * np.max(np.abs(x))
     # A difference of two columns of a text file, perhaps in degrees there, has the rounding of both.
-    of_text = 0.0
+    levels, of_text = np.unique(x), 0.0
     for scale, digits in itertools.product((1.0, 180 / np.pi), range(3, 13)):
-        if np.max(np.abs(scale * x - np.round(scale * x, digits))) <= scale * arithmetic:
+        rest = (np.abs(scale * v - np.round(scale * v, digits)) for v in (levels[:100], levels))
+        if all(np.max(r) <= scale * arithmetic for r in rest):  # most signals fail in the first levels
             of_text = 2.01 * 10.0**-digits / scale
             break
-    steps = (_lattice(x, rounding) for rounding in (of_text, arithmetic) if rounding >= arithmetic)
+    steps = (
+        _lattice(levels, len(x), rounding) for rounding in (of_text, arithmetic) if rounding >= arithmetic
+    )
     return next((float(f"{step:.10g}") for step in steps if step), None)
 
 
-def _lattice(x: Float[np.ndarray, " N"], rounding: float) -> float | None:
-    """The step of a quantised signal, in which values are one level if they differ by `rounding` or less."""
-    levels = np.unique(x).astype(np.float64)
+def _lattice(values: Float[np.ndarray, " M"], count: int, rounding: float) -> float | None:
+    """The step of the distinct values of `count` samples; those that differ by `rounding` are one level."""
+    levels = values.astype(np.float64)
     levels = levels[np.diff(levels, prepend=-np.inf) > rounding]
-    if len(levels) < 10 or len(levels) == len(x):
+    if len(levels) < 10 or len(levels) == count:
         return None
     gaps = np.diff(levels)
     smallest = np.median(gaps[gaps < 1.5 * gaps.min()])
