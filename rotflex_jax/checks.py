@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
-from jaxtyping import Float, Num
+from jaxtyping import Float, Num, Shaped
 
 from rotflex_jax.errors import InputError
 
@@ -119,6 +119,14 @@ give for instance 1.
     return int(value)
 
 
+def as_array(value: Any) -> Shaped[np.ndarray, "..."]:
+    """What was given as an array; an array of an object where NumPy makes none, as of unequal rows."""
+    try:
+        return np.asarray(value)
+    except (TypeError, ValueError):
+        return np.asarray(None)
+
+
 def vector(values: Any, name: str, count: int | None = None, *, example: str) -> Float[np.ndarray, " N"]:
     """A vector of finite real numbers.
 
@@ -131,10 +139,7 @@ def vector(values: Any, name: str, count: int | None = None, *, example: str) ->
     Raises:
         InputError: The values are no such vector.
     """
-    try:
-        found = np.asarray(values)
-    except (TypeError, ValueError):  # of unequal length
-        found = np.asarray(None)
+    found = as_array(values)
     plain = found.dtype.kind in "biuf" and found.ndim == 1 and count in (None, len(found))
     if plain and np.all(np.isfinite(found)):
         return found.astype(float)
@@ -287,10 +292,7 @@ def signal(u: Any, name: str = "u") -> Float[np.ndarray, " N"]:
     Raises:
         InputError: The signal has more than one column, is complex or empty, is masked, or is not finite.
     """
-    try:
-        array = np.asarray(u)
-    except (TypeError, ValueError):
-        array = np.asarray(None)
+    array = as_array(u)
     if array.dtype.kind not in "iuf" or array.ndim != 1 or not array.size:
         what = f"{array.dtype.name} of shape {array.shape}" if array.dtype != object else shown(u)
         raise InputError(

@@ -10,7 +10,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, Inexact, Real, Shaped
 
-from rotflex_jax.checks import all_finite, shown
+from rotflex_jax.checks import all_finite, as_array, shown
 from rotflex_jax.errors import InputError
 
 
@@ -64,10 +64,7 @@ choose a value in this range.
     """
     if isinstance(value, Tracer):
         return
-    try:
-        numbers = np.asarray(value)
-    except ValueError:  # rows of different lengths
-        numbers = np.asarray(None)
+    numbers = as_array(value)
     if numbers.dtype.kind not in "iuf":
         raise InputError(
             f"Argument `{name}` must be a number or an array of numbers, but is {shown(value)}; give numbers."

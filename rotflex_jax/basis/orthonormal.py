@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from rotflex_jax.basis.bank import Bank
-from rotflex_jax.checks import entries, shown, whole
+from rotflex_jax.checks import as_array, entries, shown, whole
 from rotflex_jax.errors import InputError
 from rotflex_jax.recording.samples import sampling_period
 
@@ -25,10 +25,7 @@ SectionKinds = tuple[str, ...]
 
 def _listed(poles: Any, name: str, example: str) -> Complex[np.ndarray, " M"]:
     """Poles that a user gives, one or several in a row, as finite numbers."""
-    try:
-        found = np.atleast_1d(np.asarray(poles if (several := entries(poles)) is None else several))
-    except ValueError:  # rows of different lengths
-        found = np.asarray(None)
+    found = np.atleast_1d(as_array(poles if (several := entries(poles)) is None else several))
     if found.dtype.kind not in "iufc" or found.ndim != 1 or not found.size or not np.isfinite(found).all():
         raise InputError(
             f"Argument `{name}` must list finite numbers, at least one, but is {shown(poles)}; "
