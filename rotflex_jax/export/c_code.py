@@ -170,7 +170,7 @@ def _heading(mechanism: Mechanism, model: Model, Ts: float) -> Iterator[str]:
         yield " * " + in_c_comment(f"{effect.title} at {effect.at}{off}: {effect.equation}")
         declared = specifications(effect)
         for n, v in effect.values.items():
-            unit = mechanism.units_of(effect).of(effect, declared[n].unit)
+            unit = mechanism.unit_of(effect, declared[n].unit)
             yield " *     " + in_c_comment(f"{n} = {v:.10g} {unit}".rstrip())
     yield " */"
 

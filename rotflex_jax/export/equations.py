@@ -200,7 +200,7 @@ def _with_equations(mechanism: Mechanism) -> Iterator[Effect]:
 def _parameters(mechanism: Mechanism, effect: Effect) -> Iterator[tuple[str, float, str, str]]:
     """Name, value, unit and meaning of the parameters of an effect."""
     for (name, value), spec in zip(effect.values.items(), specifications(effect).values(), strict=True):
-        yield name, float(value), mechanism.units_of(effect).of(effect, spec.unit), spec.meaning
+        yield name, float(value), mechanism.unit_of(effect, spec.unit), spec.meaning
 
 
 def _plain(value: float) -> str:

@@ -246,7 +246,7 @@ def beyond_recordings(m: Mechanism, reach: Reach, effects: Iterable[Effect] | No
             full, value = effect.full_name(name), float(getattr(effect, name))
             if full in m.trusted:
                 continue
-            unit, limit = m.units_of(effect).of(effect, spec.unit), reach.limit(effect, spec.unit)
+            unit, limit = m.unit_of(effect, spec.unit), reach.limit(effect, spec.unit)
             if limit is not None and abs(value) > BEYOND * limit[0]:
                 why = (
                     f"is far beyond what these recordings reach ({limit[1]}: {limit[0]:.3g} {unit}), so that "

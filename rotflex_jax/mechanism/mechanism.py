@@ -387,14 +387,16 @@ class Mechanism:
     def parameter_specifications(self) -> tuple[Specification, ...]:
         """Unit, bounds and typical size of each parameter, in the order of `values`."""
         return tuple(
-            dataclasses.replace(
-                s, unit=self.units_of(e).of(e, s.unit), typical=s.typical * self.units.size(s.unit)
-            )
+            dataclasses.replace(s, unit=self.unit_of(e, s.unit), typical=s.typical * self.units.size(s.unit))
             for e in self.effects
             for s in specifications(e).values()
         )
 
-    def units_of(self, effect: Effect) -> Units:
+    def unit_of(self, effect: Effect, declared: str) -> str:
+        """The unit of this machine for the declared unit of a parameter of an effect."""
+        return self._units_of(effect).of(effect, declared)
+
+    def _units_of(self, effect: Effect) -> Units:
         """Units of the parameters of an effect: a sensor has that of its channel in the place of `rad`."""
         if not isinstance(effect, Sensing) or effect.at not in self.channels:
             return self.units
@@ -405,7 +407,7 @@ class Mechanism:
         per = f" per {effect.signal_unit}" if effect.signal_unit else ""
         own = [re.escape(part) for part in (effect.signal_name, per) if part]
         parts = re.split(f"({'|'.join(own)})", effect.sentence()) if own else [effect.sentence()]
-        units = self.units_of(effect)
+        units = self._units_of(effect)
         parts[::2] = [units.sentence(part, effect.volts_of_input) for part in parts[::2]]
         return "".join(parts)
 
@@ -526,7 +528,7 @@ class Mechanism:
                 full = e.full_name(name)
                 held = {"held": "  (trusted)", "": ""}.get(state := self._status(full), f"  ({state})")
                 number = value if not isinstance(value, (int, float)) else f"{value:.6g}"
-                unit = self.units_of(e).of(e, specifications(e)[name].unit)
+                unit = self.unit_of(e, specifications(e)[name].unit)
                 lines.append(f"  {full} = {number} {unit}{held}")
         return "\n".join(lines)
 

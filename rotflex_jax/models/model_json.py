@@ -157,7 +157,7 @@ def _effect(effect: Effect, mechanism: Mechanism) -> dict[str, Any]:
     parameters = {
         name: {
             "value": _json(float(value)),
-            "unit": mechanism.units_of(effect).of(effect, declared[name].unit),
+            "unit": mechanism.unit_of(effect, declared[name].unit),
             "bounds": [_json(declared[name].lower), _json(declared[name].upper)],
             "trusted": effect.full_name(name) in mechanism.trusted,
             "meaning": declared[name].meaning,
@@ -297,7 +297,7 @@ def from_dict(data: Mapping[str, Any]) -> Saved:
         signals=tuple(given.get("signals", ())),
     )
     for effect, saved in zip(mechanism.effects, given["effects"], strict=True):
-        _check_units(mechanism.units_of(effect), effect, saved["parameters"])
+        _check_units(mechanism, effect, saved["parameters"])
     rule = dict(data["solver"])
     name = rule.pop("rule")
     if name not in _SOLVERS:
@@ -338,12 +338,13 @@ def _effect_back(given: Mapping[str, Any]) -> Effect:
     return effect.replace(**{key: p["value"] for key, p in parameters.items() if key in known})
 
 
-def _check_units(units: Units, effect: Effect, parameters: Mapping[str, Any]) -> None:
+def _check_units(mechanism: Mechanism, effect: Effect, parameters: Mapping[str, Any]) -> None:
     """Refuses parameters that the effect does not have, or has in another unit."""
     declared = effect.declared() | specifications(effect)
+    units = {name: mechanism.unit_of(effect, s.unit) for name, s in declared.items()}
     for key, p in parameters.items():
-        if key not in declared or units.of(effect, declared[key].unit) != p["unit"]:
-            has = ", ".join(f"{n} [{units.of(effect, s.unit)}]" for n, s in declared.items())
+        if units.get(key) != p["unit"]:
+            has = ", ".join(f"{name} [{unit}]" for name, unit in units.items())
             raise InputError(
                 f"The file gives {effect.name!r} the parameter {key} [{p['unit']}], but the effect has {has}"
                 "; use the version of the effect that the file was written with."
