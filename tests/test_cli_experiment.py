@@ -37,8 +37,9 @@ def called(*arguments: object) -> int:
         (["--between", "coulomb", "lag@input", "--voltage", "5"], "given no port"),
         (["--between", "delay@input", "lag@input", "--voltage", "-5"], "positive number in V"),
         (["--between", "delay@input", "lag@input"], "--voltage"),
-        (["--between", "delay@input", "lag@input", "--voltage", "5", "--seconds", "0.1"], "200 samples"),
+        (["--between", "delay@input", "lag@input", "--voltage", "5", "--seconds", "0.1"], "needs 200 to 10000000"),
         (["--between", "delay@input", "lag@input", "--voltage", "5", "--seconds", "0"], "--seconds 20"),
+        (["--between", "delay@input", "lag@input", "--voltage", "5", "--seconds", "1e9"], "10000000 samples"),
         (
             ["--between", "delay@input", "lag@input", "--voltage", "5", "--travel", "-3"],
             "given -3, but needs",
@@ -52,6 +53,26 @@ def called(*arguments: object) -> int:
 )
 def test_bad_input_is_one_sentence(run, changes, match, capsys):
     assert called("--fit", run, *changes) == 2
+    told = capsys.readouterr().err.strip()
+    assert match in told and told.startswith("rotflex: ") and "\n" not in told
+
+
+@pytest.mark.parametrize(
+    ("changes", "match"),
+    [
+        (["--error", "7"], "--error was given 7, but it is the probability"),
+        (["--error", "0"], "between 0 and 0.5"),
+        (["--max-seconds", "-3"], "--max-seconds was given -3, but the experiment needs at least 1 s"),
+        (["--max-seconds", "inf"], "--max-seconds 60"),
+    ],
+)
+def test_an_impossible_end_is_refused_before_anything_is_fitted(
+    run, changes, match, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.setattr("rotflex_jax.fit", None)
+    state = tmp_path / "state.json"
+    between = ("--between", "delay@input", "lag@input", "--voltage", "5", "--state", state)
+    assert called("--fit", run, *between, *changes) == 2
     told = capsys.readouterr().err.strip()
     assert match in told and told.startswith("rotflex: ") and "\n" not in told
 

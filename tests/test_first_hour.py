@@ -604,6 +604,20 @@ def test_one_angle_in_degrees_and_one_in_radians(run, tmp_path) -> None:  # noqa
     assert_one_sentence(err, "the channel 'theta' for 'servo' and for 'arm'")
 
 
+def test_a_unit_at_the_end_of_a_name_in_capitals_is_read() -> None:
+    table = pd.DataFrame(
+        {"timeMs": 1e3 * T, "voltage": RECORDING.u, "servoDeg": np.rad2deg(THETA), "armRad": RECORDING.y[:, 1]}
+    )
+    found = rf.load(table, time="timeMs", outputs=("servoDeg", "armRad"))
+    assert np.allclose(found.y, RECORDING.y) and found.Ts == pytest.approx(RECORDING.Ts)
+    assert [str(f) for f in found.remarks if f.kind == "converted"] == [
+        "Column 'servoDeg' was converted from degrees because of its name.",
+        "The time 'timeMs' was converted from ms because of its name.",
+    ]
+    with pytest.raises(rf.InputError, match="'servoDeg' is in deg by its name, but was given in rad"):
+        rf.load(table, time="timeMs", outputs=("servoDeg", "armRad"), units={"theta": "rad"})
+
+
 def test_a_model_in_radians_takes_no_recording_in_degrees() -> None:
     recording = rf.Recording(
         RECORDING.u, RECORDING.y, RECORDING.Ts, channels=RECORDING.channels, units=("deg", "rad")

@@ -426,6 +426,8 @@ def test_equations_with_friction_take_their_place_in_the_table(monkeypatch: pyte
         (("--joint", "quanser_2002"), "--joint was given without --data"),
         (("--degrees",), "how to read a file was given without --data"),
         (("--split", "2", "--data", "a.csv"), "between 0 and 1"),
+        (("--split", "0.5", "--data", "rotflex"), "the second is held out"),
+        (("--degrees", "--data", "rotflex"), "its files are read as they need"),
         (("--joint", "rigid"), "joint"),
         (("--nonsense",), "--help"),
     ],

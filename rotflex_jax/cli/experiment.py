@@ -101,6 +101,7 @@ def experiment(
                 f"{state} is there already; go on with --continue {state}, or name another state."
             )
         _check_voltage_file(state, save, 1, fit)
+        _check_end(error, max_seconds)
     if plot is not None and plot.suffix not in FIGURE_ENDINGS:
         raise InputError(
             f"{plot} has the ending {plot.suffix or '(none)'}, but a figure is written as "
@@ -299,6 +300,22 @@ def _in_unit(option: str, value: float, unit: str) -> float:
             "bears."
         )
     return value / of_one
+
+
+def _check_end(error: float, max_seconds: float) -> None:
+    """Refuse an impossible end of a sequential experiment before anything is fitted."""
+    from rotflex_jax.experiment.sequential import SEGMENT_SECONDS
+
+    if not 0 < error < 0.5:
+        raise InputError(
+            f"--error was given {error:g}, but it is the probability of a wrong answer and must lie between 0 "
+            "and 0.5; give for instance --error 0.01."
+        )
+    if not SEGMENT_SECONDS <= max_seconds < math.inf:
+        raise InputError(
+            f"--max-seconds was given {max_seconds:g}, but the experiment needs at least {SEGMENT_SECONDS:g} "
+            "s, the length of one segment; give for instance --max-seconds 60."
+        )
 
 
 def _check_length(seconds: float, Ts: float) -> None:

@@ -157,7 +157,12 @@ def _words(table: Table, name: str) -> set[str]:
 
 
 def _split(text: str) -> set[str]:
-    return set(re.split(r"[^\w°]+|[\d_]+", text.lower()))
+    return set(re.split(r"[^\w°]+|[\d_]+", _spaced(text).lower()))
+
+
+def _spaced(text: str) -> str:
+    """The text with a space before a word that begins with a capital letter, as in `thetaDeg`."""
+    return re.sub(r"(?<=[a-z]{2})(?=[A-Z][a-z])", " ", text)
 
 
 def _as_written(table: Table, name: str, word: str) -> str:
@@ -167,7 +172,7 @@ def _as_written(table: Table, name: str, word: str) -> str:
 
 def _word_in(word: str, text: str) -> str:
     """A word in the spelling of the text; empty if the text does not have it."""
-    said = re.search(rf"(?<![^\W\d_]){re.escape(word)}(?![^\W\d_])", text, re.I)
+    said = re.search(rf"(?<![^\W\d_]){re.escape(word)}(?![^\W\d_])", _spaced(text), re.I)
     return said[0] if said else ""
 
 
@@ -394,7 +399,7 @@ def time_stamps(
 
 def _time_unit(table: Table, name: str, by_name: bool) -> tuple[str | None, str]:
     """Unit of a time by the unit in the file, or by the last word of the name; and where it is said."""
-    last = re.findall(r"[^\W\d_]+", name_and_unit(name)[0].lower())[-1:] if by_name else []
+    last = re.findall(r"[^\W\d_]+", _spaced(name_and_unit(name)[0]).lower())[-1:] if by_name else []
     for word in (_unit(table, name).lower(), *last):
         unit = TIME_WORDS.get(word, word if word in TIME_UNITS else None)
         if unit is not None:

@@ -46,6 +46,8 @@ from rotflex_jax.models.model import Model
 
 # One period of a design [s].
 DESIGN_PERIOD = 4.0
+# Largest number of samples of an experiment.
+MOST_SAMPLES = 10_000_000
 # Evidence that makes one of two equally probable effects 99 % probable [nat].
 ENOUGH = math.log(99)
 
@@ -350,10 +352,11 @@ def _rival_pair(
 def sample_counts(seconds: float, Ts: float) -> tuple[int, int]:
     """Number of samples of the experiment and of one period of a design."""
     length, period = checks.real(seconds), checks.real(Ts)
-    if not (0 < period < 0.5 and 200 <= length / period < np.inf):
+    if not (0 < period < 0.5 and 200 <= length / period <= MOST_SAMPLES):
         raise InputError(
             f"An experiment of {checks.shown(seconds)} s at a sampling period of {checks.shown(Ts)} s was "
-            "asked for, but it needs at least 200 samples; give for instance seconds=20, Ts=0.002."
+            f"asked for, but it needs 200 to {MOST_SAMPLES} samples; give for instance seconds=20, "
+            "Ts=0.002."
         )
     N = round(seconds / Ts)
     return N, min(N, round(DESIGN_PERIOD / Ts))
