@@ -19,6 +19,7 @@ from typing import Any, ClassVar, Literal, NamedTuple, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float, Real
 
 from rotflex_jax.checks import known_arguments, shown
@@ -232,15 +233,16 @@ class Effect(abc.ABC):
             value = getattr(self, name)
             if value is None and getattr(type(self), name) is None:
                 continue  # an optional part that the instance does not have
-            if isinstance(value, np.ndarray) and value.ndim == 0:
-                value = value[()]  # an array has no hash, a number has one
+            array = isinstance(value, np.ndarray | jax.Array) and not isinstance(value, Tracer)
+            if array and np.ndim(value) == 0 and not np.ma.is_masked(value):
+                value = value.item()  # an array has no hash, a number has one
                 object.__setattr__(self, name, value)
-            if isinstance(value, _NO_NUMBERS):
+            if isinstance(value, _NO_NUMBERS) or np.ndim(value):
                 raise InputError(
                     f"{kind} was given {name}={shown(value)}, but it needs a number"
                     f"{f' in {spec.unit}' if spec.unit else ''}; give one."
                 )
-            if isinstance(value, jax.Array) or not isinstance(value, numbers.Real):
+            if not isinstance(value, numbers.Real):
                 continue  # traced or symbolic: checked where the number was given
             try:
                 number = float(value)
