@@ -37,7 +37,7 @@ def called(*arguments: object) -> int:
         (["--between", "coulomb", "lag@input", "--voltage", "5"], "given no port"),
         (["--between", "delay@input", "lag@input", "--voltage", "-5"], "positive number in V"),
         (["--between", "delay@input", "lag@input"], "--voltage"),
-        (["--between", "delay@input", "lag@input", "--voltage", "5", "--seconds", "0.1"], "needs 200 to 10000000"),
+        (["--between", "delay@input", "lag@input", "--voltage", "5", "--seconds", "0.1"], "200 to 10000000"),
         (["--between", "delay@input", "lag@input", "--voltage", "5", "--seconds", "0"], "--seconds 20"),
         (["--between", "delay@input", "lag@input", "--voltage", "5", "--seconds", "1e9"], "10000000 samples"),
         (

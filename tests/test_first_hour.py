@@ -606,7 +606,7 @@ def test_one_angle_in_degrees_and_one_in_radians(run, tmp_path) -> None:  # noqa
 
 def test_a_unit_at_the_end_of_a_name_in_capitals_is_read() -> None:
     table = pd.DataFrame(
-        {"timeMs": 1e3 * T, "voltage": RECORDING.u, "servoDeg": np.rad2deg(THETA), "armRad": RECORDING.y[:, 1]}
+        {"timeMs": 1e3 * T, "voltage": U, "servoDeg": np.rad2deg(THETA), "armRad": RECORDING.y[:, 1]}
     )
     found = rf.load(table, time="timeMs", outputs=("servoDeg", "armRad"))
     assert np.allclose(found.y, RECORDING.y) and found.Ts == pytest.approx(RECORDING.Ts)

@@ -308,8 +308,8 @@ def _check_end(error: float, max_seconds: float) -> None:
 
     if not 0 < error < 0.5:
         raise InputError(
-            f"--error was given {error:g}, but it is the probability of a wrong answer and must lie between 0 "
-            "and 0.5; give for instance --error 0.01."
+            f"--error was given {error:g}, but it is the probability of a wrong answer and must lie between "
+            "0 and 0.5; give for instance --error 0.01."
         )
     if not SEGMENT_SECONDS <= max_seconds < math.inf:
         raise InputError(

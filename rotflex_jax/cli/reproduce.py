@@ -120,13 +120,13 @@ def _recordings(
     if data == ["rotflex"] and not Path("rotflex").exists():
         if split is not None:
             raise InputError(
-                "--split was given with --data rotflex, but the first recording of that set is fitted and the "
-                "second is held out; leave it out, or name a file with --data."
+                "--split was given with --data rotflex, but the first recording of that set is fitted and "
+                "the second is held out; leave it out, or name a file with --data."
             )
         if columns != Columns() and not held_out:
             raise InputError(
-                "An option that says how to read a file was given with --data rotflex, but its files are read "
-                "as they need; leave it out, or name a file with --data."
+                "An option that says how to read a file was given with --data rotflex, but its files are "
+                "read as they need; leave it out, or name a file with --data."
             )
         from rotflex_jax.data.datasets import load_dataset
 

@@ -233,11 +233,11 @@ class Effect(abc.ABC):
             value = getattr(self, name)
             if value is None and getattr(type(self), name) is None:
                 continue  # an optional part that the instance does not have
-            array = isinstance(value, np.ndarray | jax.Array) and not isinstance(value, Tracer)
-            if array and np.ndim(value) == 0 and not np.ma.is_masked(value):
+            plain = not isinstance(value, Tracer) and not np.ma.is_masked(value)
+            if plain and isinstance(value, np.ndarray | jax.Array) and value.ndim == 0:
                 value = value.item()  # an array has no hash, a number has one
                 object.__setattr__(self, name, value)
-            if isinstance(value, _NO_NUMBERS) or np.ndim(value):
+            if isinstance(value, _NO_NUMBERS) or getattr(value, "ndim", 0):
                 raise InputError(
                     f"{kind} was given {name}={shown(value)}, but it needs a number"
                     f"{f' in {spec.unit}' if spec.unit else ''}; give one."
