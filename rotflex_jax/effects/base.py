@@ -237,7 +237,7 @@ class Effect(abc.ABC):
             if plain and isinstance(value, np.ndarray | jax.Array) and value.ndim == 0:
                 value = value.item()  # an array has no hash, a number has one
                 object.__setattr__(self, name, value)
-            if isinstance(value, _NO_NUMBERS) or getattr(value, "ndim", 0):
+            if isinstance(value, _NO_NUMBERS) or (plain and getattr(value, "ndim", 0)):
                 raise InputError(
                     f"{kind} was given {name}={shown(value)}, but it needs a number"
                     f"{f' in {spec.unit}' if spec.unit else ''}; give one."
