@@ -141,6 +141,7 @@ def vector(values: Any, name: str, count: int | None = None, *, example: str) ->
     """
     found = as_array(values)
     plain = found.dtype.kind in "biuf" and found.ndim == 1 and count in (None, len(found))
+    plain = plain and not np.ma.is_masked(values)
     if plain and np.all(np.isfinite(found)):
         return found.astype(float)
     many = "numbers" if count is None else "one number" if count == 1 else f"{count} numbers"

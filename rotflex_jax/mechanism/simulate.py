@@ -11,7 +11,7 @@ from jax.core import Tracer
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Integer, Real
 
-from rotflex_jax.checks import positive, shown, signal
+from rotflex_jax.checks import positive, shown, signal, vector
 from rotflex_jax.effects.base import Sensing
 from rotflex_jax.errors import InputError
 from rotflex_jax.mechanism.assembly import Layout, effects_of, motor_inputs, own_states, rest_state
@@ -21,6 +21,7 @@ from rotflex_jax.mechanism.scan import BLOCKED_FROM_SAMPLES, linear_outputs, sta
 from rotflex_jax.mechanism.small_matrices import evaluate_effect, matvec, sparse_matvec
 from rotflex_jax.mechanism.smooth_rk4 import SmoothRK4
 from rotflex_jax.mechanism.step import Exponential
+from rotflex_jax.recording import Recording
 from rotflex_jax.runtime.persistent_jit import persistent_jit
 from rotflex_jax.runtime.xla import working_precision
 
@@ -293,7 +294,7 @@ def first_state(
     start = rest.copy()
     if x0 is None:
         return start
-    known = signal(x0, "x0")
+    known = vector(x0, "x0", example="[0.1, 0.0], the positions")
     if len(known) > len(start):
         raise InputError(
             f"Argument `x0` has {len(known)} entries, but the model has {len(start)} states; give its "
@@ -356,6 +357,11 @@ def _simulated(run, mechanism, u, Ts, x0, solver):  # noqa: ANN001, ANN202 - typ
 def _input(mechanism: Mechanism, u: Any) -> Float[np.ndarray, "N *c"]:
     """The voltage, with the signals beside it if the mechanism takes signals; checked."""
     names = mechanism.signals
+    if isinstance(u, Recording):
+        raise InputError(
+            "Argument `u` must be the samples of the voltage, but is a Recording; pass its u and its Ts, or "
+            "write Model(mechanism).simulate(recording), which also starts from its first state."
+        )
     if isinstance(u, Tracer):
         raise InputError(
             "JAX traces `u`, but its samples are needed here; inside of jax.jit or jax.grad use "
