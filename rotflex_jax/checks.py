@@ -31,8 +31,12 @@ def shown(value: Any) -> str:
     if value is None or isinstance(value, bool | int | float | complex | str):
         text = repr(value)
         return text if len(text) <= 60 else f"{text[:57]}..."
-    kind = type(value).__name__
-    return f"an {kind}" if kind[0].lower() in "aeiou" else f"a {kind}"
+    return _with_article(type(value).__name__)
+
+
+def _with_article(name: str) -> str:
+    """A name of a class behind its indefinite article."""
+    return f"an {name}" if name[0].lower() in "aeiou" else f"a {name}"
 
 
 def real(value: Any) -> float:
@@ -154,7 +158,8 @@ def vector(values: Any, name: str, count: int | None = None, *, example: str) ->
 def instance(value: Any, kind: type, name: str, hint: str) -> None:
     """Refuses a value that is no instance of `kind`; `hint` states how to get one."""
     if not isinstance(value, kind):
-        raise InputError(f"Argument `{name}` must be a {kind.__name__}, but is {shown(value)}; {hint}.")
+        needed = _with_article(kind.__name__)
+        raise InputError(f"Argument `{name}` must be {needed}, but is {shown(value)}; {hint}.")
 
 
 def one_of(value: Any, name: str, choices: Iterable[str]) -> str:

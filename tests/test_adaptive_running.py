@@ -6,9 +6,21 @@ import numpy as np
 import pytest
 from adaptive_records import noisy_record
 
-from rotflex_jax.adaptive import LMS, NLMS, RLS, AffineProjection, Kalman, VolterraLattice, run, scan
+from rotflex_jax.adaptive import (
+    LMS,
+    NLMS,
+    RLS,
+    AffineProjection,
+    Kalman,
+    VolterraLattice,
+    identify,
+    run,
+    scan,
+)
 from rotflex_jax.adaptive.running import _run
+from rotflex_jax.basis import Delays, Volterra
 from rotflex_jax.errors import InputError
+from rotflex_jax.recording import Recording
 
 FILTERS = {
     "lms": LMS(0.01, leakage=0.02),
@@ -26,6 +38,24 @@ def record(filter, N: int = 200) -> tuple[np.ndarray, np.ndarray]:
     """Regressors (N, 6), or the input from which the filter computes them, and the output."""
     phi, y = noisy_record(N, memory=2)
     return (phi[:, 1] if filter.from_input else phi), y
+
+
+def test_a_run_is_said_in_a_line() -> None:
+    """Without adaptation the errors are the outputs, here 4 and, in the last quarter, 2."""
+    got = run(LMS(0.0), np.ones((8, 1)), np.array([4.0] * 6 + [-2.0] * 2))
+    rms = np.sqrt((6 * 16 + 2 * 4) / 8)
+    assert str(got) == f"Run of 8 samples, 1 weight: a-priori error {rms:.3g} rms, 2 over the last quarter"
+    wrong = run(LMS(mu=3.0), np.ones((100, 1)), np.ones(100))
+    assert str(wrong) == "Run of 100 samples, 1 weight: diverged at sample 14"
+
+
+def test_what_was_identified_is_said_in_two_lines() -> None:
+    u = np.random.default_rng(3).normal(size=300)
+    recording = Recording(u=u, y=np.c_[2.0 * u], Ts=0.01, channels=("theta",), n_init=20)
+    got = identify(NLMS(0.5), Volterra(Delays(2), order=1), recording, "theta")
+    first, second = str(got).split("\n")
+    assert first == f"Filter for theta over 3 terms, every 0.01 s, online NMSE {got.online_nmse:.3g}"
+    assert second == str(got.run) and second.startswith("Run of 280 samples, 3 weights: ")
 
 
 @every_filter

@@ -699,7 +699,7 @@ BAD: dict[tuple[str, str], list[tuple[Any, str]]] = {
     ],
     ("assess", "controller"): [(None, "must be a Controller, but is None")],
     ("controller_to_c", "controller"): [("x", "must be a Controller, but is 'x'")],
-    ("adaptive.identify", "filter"): [(None, "must be a AdaptiveFilter, but is None"), ("rls", "is 'rls'")],
+    ("adaptive.identify", "filter"): [(None, "must be an AdaptiveFilter, but is None"), ("rls", "is 'rls'")],
     ("joints.quanser_2010", "arm"): [([], "given a list"), (4, "given 4")],
     ("joints.quanser_2010", "spring"): [([], "given a list"), ("x", "given 'x'")],
     ("joints.quanser_2010", "sensors"): [(["x"], "but is 'x'")],

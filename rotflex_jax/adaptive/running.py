@@ -52,6 +52,16 @@ class Run:
         """Whether the filter diverged."""
         return self.status != "ok"
 
+    def __str__(self) -> str:
+        count = len(self.weights)
+        size = f"{len(self.errors)} samples, {count} weight{'s' * (count != 1)}"
+        if self.diverged:
+            return f"Run of {size}: {self.status}"
+        e = np.abs(self.errors)
+        last = e[-max(1, len(e) // 4) :]
+        parts = [f"{np.sqrt(np.mean(part**2)):.3g}" for part in (e, last)]
+        return f"Run of {size}: a-priori error {parts[0]} rms, {parts[1]} over the last quarter"
+
 
 def run(
     filter: AdaptiveFilter,
@@ -260,6 +270,11 @@ class Identified:
         return Series(
             self.basis, self.run.weights, self.channel, self.recording.Ts, self.recording.input_unit, unit
         )
+
+    def __str__(self) -> str:
+        online = "" if self.run.diverged else f", online NMSE {self.online_nmse:.3g}"
+        terms = f"{self.channel} over {self.basis.size} terms, every {self.recording.Ts:g} s"
+        return f"Filter for {terms}{online}\n{self.run}"
 
     @property
     def online_nmse(self) -> float:
