@@ -85,7 +85,7 @@ def margin(e: Experiment, model: rf.Model, truth: tuple, rival: tuple, rec: rf.R
     noise = np.array(list(e.noise.values()))
     found = []
     for me, other in ((truth, rival), (rival, truth)):
-        effect = CATALOG[me[0]](at=me[1], **e.numbers["@".join(me)])
+        effect = CATALOG[me[0]](at=me[1], **e.parameters["@".join(me)])
         found.append(evidence(rival_model(model, effect, other, {}, noise, TS), rec, noise))
     (mine, one), (its, two) = found
     return {"margin": mine - its, "converged": one and two}
@@ -111,7 +111,7 @@ def trial(name: str, seed: int, starts: int, say) -> dict:
         progress=say,
     )
     made = {(s.kind, s.setting): s.u for s in standard_inputs(round(SECONDS / TS), TS, LIMITS)}
-    row = {"pair": name, "seed": seed, "status": fit.status, "numbers": e.numbers, "inputs": []}
+    row = {"pair": name, "seed": seed, "status": fit.status, "numbers": e.parameters, "inputs": []}
     row["original"] = margin(e, fit.model, truth, rival, first)
     ranked = sorted((r for r in e.table if (r.input, r.setting) in made), key=lambda r: -r.nats)
     row["ranked"] = [[r.input, r.setting, r.voltage, *r.each, r.nats] for r in ranked]

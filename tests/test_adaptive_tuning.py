@@ -230,7 +230,7 @@ def test_a_pole_is_found_through_the_filter() -> None:
     bank = Orthonormal.laguerre(0.4, 1)
 
     def build(settings: dict) -> tuple[RLS, Volterra]:
-        return RLS(), Volterra(bank.with_numbers(settings["pole"][None]), order=1, constant=False)
+        return RLS(), Volterra(bank.with_parameters(settings["pole"][None]), order=1, constant=False)
 
     basis = Volterra(bank, order=1, constant=False)
     found = tune(

@@ -9,7 +9,7 @@ from linear_joint import PAPER, POLES, impulse_response
 from scipy.signal import lfilter
 
 from rotflex_jax.basis import Orthonormal, Volterra, minimum_nmse
-from rotflex_jax.basis.orthonormal import coordinates, numbers_of
+from rotflex_jax.basis.orthonormal import coordinates, parameters_of
 from rotflex_jax.errors import InputError
 from rotflex_jax.runtime.xla import double_precision
 
@@ -118,16 +118,17 @@ def test_the_delay_of_the_bank_moves_it() -> None:
 def test_a_gradient_goes_through_the_poles() -> None:
     bank, u = Orthonormal((0.5, 0.6 + 0.3j, 0.6 - 0.3j)), noise(20)
 
-    def output(numbers):
-        phi = Volterra(bank.with_numbers(numbers), 2).respond(jnp.asarray(u))
+    def output(parameters):
+        phi = Volterra(bank.with_parameters(parameters), 2).respond(jnp.asarray(u))
         return jnp.sum(phi @ jnp.arange(1.0, 11.0))
 
     with double_precision():
-        numbers = jnp.asarray(bank.numbers)
-        slope = np.asarray(jax.jit(jax.jacfwd(output))(numbers))
+        parameters = jnp.asarray(bank.parameters)
+        slope = np.asarray(jax.jit(jax.jacfwd(output))(parameters))
         h = 1e-6
         by_difference = [
-            float(output(numbers.at[k].add(h)) - output(numbers.at[k].add(-h))) / (2 * h) for k in range(3)
+            float(output(parameters.at[k].add(h)) - output(parameters.at[k].add(-h))) / (2 * h)
+            for k in range(3)
         ]
     np.testing.assert_allclose(slope, by_difference, rtol=1e-7)
 
@@ -147,7 +148,10 @@ def test_poles_from_a_generator_are_those_of_the_list() -> None:
         (lambda: Orthonormal((np.nan,)), "finite numbers"),
         (lambda: Orthonormal(["0.5"]), "`poles` must list finite numbers, at least one, but is a list"),
         (lambda: Orthonormal([True]), "`poles` must list finite numbers"),
-        (lambda: Orthonormal.at("fast", 0.01), "`continuous_poles` must list finite numbers, .* is 'fast'"),
+        (
+            lambda: Orthonormal.at("fast", 0.01),
+            "`continuous_poles` must list finite numbers, .* is 'fast'",
+        ),
         (lambda: Orthonormal.laguerre(0.5 + 0.1j, 3), "have one real pole"),
         (lambda: Orthonormal.laguerre(0.5, 0), "Argument `count` must be a whole number from 1"),
         (lambda: Orthonormal.kautz(0.5 + 0.1j, 3), "come in pairs, but 3"),
@@ -165,7 +169,7 @@ def test_bad_input_is_told_in_a_sentence(make, sentence: str) -> None:
 def test_coordinates_without_bounds_give_the_poles_back() -> None:
     """Real poles of either sign, and pairs left and right of the imaginary axis."""
     bank = Orthonormal((-0.4, 0.7, 0.6 + 0.3j, 0.6 - 0.3j, -0.2 + 0.5j, -0.2 - 0.5j))
-    z, signs = coordinates(bank.kinds, np.asarray(bank.numbers))
+    z, signs = coordinates(bank.kinds, np.asarray(bank.parameters))
     with double_precision():
-        numbers = numbers_of(bank.kinds, signs, jnp.asarray(z))
-    np.testing.assert_allclose(numbers, bank.numbers, rtol=1e-9)
+        parameters = parameters_of(bank.kinds, signs, jnp.asarray(z))
+    np.testing.assert_allclose(parameters, bank.parameters, rtol=1e-9)

@@ -360,9 +360,9 @@ def test_the_best_standard_input_is_proposed_within_what_the_machine_has_borne(a
     assert e.chosen.input in {"noise", "multisine", "prbs", "steps", "sweep"}
     assert np.max(np.abs(e.u)) <= limits.voltage == np.max(np.abs(answered.train[0].u))
     assert e.chosen.peaks["alpha"] <= limits.deflection
-    assert e.numbers["delay@input"]["time"] == 0.012
+    assert e.parameters["delay@input"]["time"] == 0.012
     # The rival fit gives a lag of about the same time.
-    assert e.numbers["lag@input"]["time"] == pytest.approx(0.012, rel=0.5)
+    assert e.parameters["lag@input"]["time"] == pytest.approx(0.012, rel=0.5)
     assert e.chosen.nats > 1
 
 

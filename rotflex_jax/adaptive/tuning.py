@@ -130,7 +130,7 @@ def tune(
     Args:
         build: function of settings by name that returns the filter, such as `lambda s: LMS(s["mu"])`; JAX
             traces it. To tune poles, it returns the filter and a basis, such as
-            `Volterra(bank.with_numbers(...))`. Another call with the same function needs no compilation.
+            `Volterra(bank.with_parameters(...))`. Another call with the same function needs no compilation.
         start: first settings, or several sets of first settings.
         basis: basis that gives the regressors of the input.
         recordings: recordings for tuning, of one length; the filter starts again on each.

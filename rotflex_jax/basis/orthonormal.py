@@ -49,12 +49,12 @@ def sections(poles: Sequence[complex]) -> tuple[SectionKinds, Float[np.ndarray, 
             f"A pole must lie inside the unit circle, but {outside[0]:.6g} has the modulus "
             f"{abs(outside[0]):.6g}; give poles of the sampled plant, exp(s Ts), that decay."
         )
-    kinds, numbers, waiting = [], [], list(given)
+    kinds, parameters, waiting = [], [], list(given)
     while waiting:
         pole = waiting.pop(0)
         if abs(pole.imag) <= 1e-12:
             kinds.append("real")
-            numbers.append(pole.real)
+            parameters.append(pole.real)
             continue
         partners = [k for k, other in enumerate(waiting) if abs(other - pole.conjugate()) <= 1e-9]
         if not partners:
@@ -64,32 +64,34 @@ def sections(poles: Sequence[complex]) -> tuple[SectionKinds, Float[np.ndarray, 
             )
         waiting.pop(partners[0])
         kinds.append("pair")
-        numbers += [pole.real, abs(pole.imag)]
-    return tuple(kinds), np.array(numbers)
+        parameters += [pole.real, abs(pole.imag)]
+    return tuple(kinds), np.array(parameters)
 
 
-def poles_of(kinds: SectionKinds, numbers: Float[np.ndarray, " M"]) -> tuple[complex, ...]:
+def poles_of(kinds: SectionKinds, parameters: Float[np.ndarray, " M"]) -> tuple[complex, ...]:
     """The poles, with the two poles of a pair next to each other."""
     poles, k = [], 0
     for kind in kinds:
         if kind == "real":
-            poles.append(complex(numbers[k]))
+            poles.append(complex(parameters[k]))
             k += 1
         else:
-            pole = complex(numbers[k], numbers[k + 1])
+            pole = complex(parameters[k], parameters[k + 1])
             poles += [pole, pole.conjugate()]
             k += 2
     return tuple(poles)
 
 
-def chain(kinds: SectionKinds, numbers: Float[Array, " M"]) -> tuple[Float[Array, "M M"], Float[Array, " M"]]:
+def chain(
+    kinds: SectionKinds, parameters: Float[Array, " M"]
+) -> tuple[Float[Array, "M M"], Float[Array, " M"]]:
     """`A`, `B` of the chain, `x+ = A x + B u`; the parameters may be traced."""
-    n = len(numbers)
-    zero = jnp.zeros(n, numbers.dtype)
-    through_x, through_u = zero, jnp.ones((), numbers.dtype)  # input of the next section
+    n = len(parameters)
+    zero = jnp.zeros(n, parameters.dtype)
+    through_x, through_u = zero, jnp.ones((), parameters.dtype)  # input of the next section
     rows, B, k = [], [], 0
     for kind in kinds:
-        own = _real(numbers[k]) if kind == "real" else _pair(numbers[k], numbers[k + 1])
+        own = _real(parameters[k]) if kind == "real" else _pair(parameters[k], parameters[k + 1])
         a, b, c, d = own
         width = len(b)
         for i in range(width):
@@ -122,9 +124,11 @@ def _pair(re: Float[Array, ""], im: Float[Array, ""]) -> Section:
     return A, jnp.stack([k, jnp.zeros_like(k)]), jnp.stack([-b * k, q * k]), -c
 
 
-def run_chain(kinds: SectionKinds, numbers: Float[Array, " M"], u: Float[Array, " N"]) -> Float[Array, "N M"]:
+def run_chain(
+    kinds: SectionKinds, parameters: Float[Array, " M"], u: Float[Array, " N"]
+) -> Float[Array, "N M"]:
     """States before each sample: the response of the chain to `u`, delayed by one sample."""
-    A, B = chain(kinds, numbers)
+    A, B = chain(kinds, parameters)
 
     def step(x: Float[Array, " M"], u: Float[Array, ""]) -> tuple[Float[Array, " M"], Float[Array, " M"]]:
         return A @ x + B * u, x
@@ -132,34 +136,34 @@ def run_chain(kinds: SectionKinds, numbers: Float[Array, " M"], u: Float[Array, 
     return jax.lax.scan(step, jnp.zeros_like(B), u)[1]
 
 
-def numbers_of(kinds: SectionKinds, signs: Sequence[float], z: Float[Array, " M"]) -> Float[Array, " M"]:
+def parameters_of(kinds: SectionKinds, signs: Sequence[float], z: Float[Array, " M"]) -> Float[Array, " M"]:
     """Parameters of the sections from unconstrained coordinates, always inside the unit circle.
 
     A real pole is `± exp(-exp(z))`, a pair `exp(-exp(z_1) ± j exp(z_2))`: the logarithms of its
     decay and of its angle per sample.
     """
     z = jnp.clip(z, -40.0, 5.0)
-    numbers, k = [], 0
+    parameters, k = [], 0
     for kind, sign in zip(kinds, signs, strict=True):
         size = jnp.exp(-jnp.exp(z[k]))
         if kind == "real":
-            numbers.append(sign * size)
+            parameters.append(sign * size)
             k += 1
         else:
             angle = jnp.exp(z[k + 1])
             # An angle beyond pi gives the same pair as its conjugate.
-            numbers += [size * jnp.cos(angle), jnp.abs(size * jnp.sin(angle))]
+            parameters += [size * jnp.cos(angle), jnp.abs(size * jnp.sin(angle))]
             k += 2
-    return jnp.stack(numbers)
+    return jnp.stack(parameters)
 
 
 def coordinates(
-    kinds: SectionKinds, numbers: Float[np.ndarray, " M"]
+    kinds: SectionKinds, parameters: Float[np.ndarray, " M"]
 ) -> tuple[Float[np.ndarray, " M"], tuple[float, ...]]:
-    """Unconstrained coordinates and signs of sections, the inverse of `numbers_of`."""
+    """Unconstrained coordinates and signs of sections, the inverse of `parameters_of`."""
     z, signs, k = [], [], 0
     for kind in kinds:
-        pole = complex(numbers[k], 0.0 if kind == "real" else numbers[k + 1])
+        pole = complex(parameters[k], 0.0 if kind == "real" else parameters[k + 1])
         # A pole at zero is clipped to the fastest decay that the coordinates express.
         z.append(np.log(-np.log(np.clip(abs(pole), 1e-12, 1 - 1e-12))))
         signs.append(-1.0 if kind == "real" and pole.real < 0 else 1.0)
@@ -199,13 +203,13 @@ class Orthonormal(Bank):
     True
     """
 
-    numbers: Any
+    parameters: Any
     kinds: SectionKinds = eqx.field(static=True)
     first: int = eqx.field(static=True)
     label: str = eqx.field(static=True)
 
     def __init__(self, poles: Sequence[complex], first: int = 1, label: str = "GOBF") -> None:
-        self.kinds, self.numbers = sections(poles)
+        self.kinds, self.parameters = sections(poles)
         self.first = whole(first, "first", 0)
         self.label = label
 
@@ -273,18 +277,18 @@ class Orthonormal(Bank):
             )
         return cls([complex(p) for p in np.exp(s * sampling_period(Ts))], first)
 
-    def with_numbers(self, numbers: Float[Array, " M"]) -> "Orthonormal":
+    def with_parameters(self, parameters: Float[Array, " M"]) -> "Orthonormal":
         """The bank with other parameters of its sections, which may be traced.
 
         Args:
-            numbers: Parameters of each section: a real pole, or real and imaginary part of a pair.
+            parameters: Parameters of each section: a real pole, or real and imaginary part of a pair.
         """
-        return eqx.tree_at(lambda bank: bank.numbers, self, numbers)
+        return eqx.tree_at(lambda bank: bank.parameters, self, parameters)
 
     @property
     def poles(self) -> tuple[complex, ...]:
         """Poles in the z domain, with the two poles of a pair next to each other."""
-        return poles_of(self.kinds, np.asarray(self.numbers))
+        return poles_of(self.kinds, np.asarray(self.parameters))
 
     def continuous_poles(self, Ts: float) -> tuple[complex, ...]:
         """Poles in continuous time, log(pole) / Ts [1/s]."""
@@ -293,7 +297,7 @@ class Orthonormal(Bank):
     @property
     def size(self) -> int:
         """Number of functions."""
-        return len(self.numbers)
+        return len(self.parameters)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -309,8 +313,8 @@ class Orthonormal(Bank):
 
     def respond(self, u: Float[Array, " N"]) -> Float[Array, "N M"]:
         """Columns for a signal, also in traced code."""
-        numbers = jnp.asarray(self.numbers).astype(u.dtype)
+        parameters = jnp.asarray(self.parameters).astype(u.dtype)
         # The states of the chain are delayed by one sample, so a bank without delay looks one sample ahead.
         ahead = jnp.concatenate([jnp.zeros(self.first, u.dtype), u, jnp.zeros(1, u.dtype)])
-        states = run_chain(self.kinds, numbers, ahead)
+        states = run_chain(self.kinds, parameters, ahead)
         return states[1 : len(u) + 1]

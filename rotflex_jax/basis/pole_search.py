@@ -14,7 +14,7 @@ import scipy
 from jaxtyping import Array, Float
 
 from rotflex_jax.basis.bank import Bank
-from rotflex_jax.basis.orthonormal import Orthonormal, SectionKinds, coordinates, numbers_of, poles_of
+from rotflex_jax.basis.orthonormal import Orthonormal, SectionKinds, coordinates, parameters_of, poles_of
 from rotflex_jax.basis.volterra import Volterra
 from rotflex_jax.checks import seed as checked_seed, signal, whole
 from rotflex_jax.errors import InputError
@@ -262,8 +262,8 @@ class _Residual:
 
     def __call__(self, z: Float[Array, " M"], args: Any) -> Float[Array, " RN"]:
         bank, u, y, counted = args
-        numbers = jnp.tile(numbers_of(self.kinds, self.signs, z), self.repeat)
-        basis = Volterra(bank.with_numbers(numbers), degrees=self.degrees, constant=self.constant)
+        parameters = jnp.tile(parameters_of(self.kinds, self.signs, z), self.repeat)
+        basis = Volterra(bank.with_parameters(parameters), degrees=self.degrees, constant=self.constant)
         phi = jax.vmap(basis.respond)(u) * counted[:, :, None]
         Q, _ = jnp.linalg.qr(phi.reshape(-1, phi.shape[2]))
         y = (y * counted).ravel()
@@ -293,8 +293,8 @@ def _descend(residual: _Residual, z: Float[np.ndarray, " M"], args: Any, most: i
             status = "converged" if end.status > 0 else f"stopped after {most} evaluations"
         except ValueError:  # scipy raises it if a number is not finite
             nmse, steps, status = float("nan"), 0, "failed: the error is not finite"
-        numbers = numbers_of(residual.kinds, residual.signs, jnp.asarray(z))
-    poles = poles_of(residual.kinds, np.asarray(numbers))
+        parameters = parameters_of(residual.kinds, residual.signs, jnp.asarray(z))
+    poles = poles_of(residual.kinds, np.asarray(parameters))
     if any(abs(p) > LARGEST_MODULUS for p in poles):
         status += ", a pole at the edge of the unit circle"
     return PoleStart(poles, nmse, status, steps)
@@ -362,7 +362,7 @@ def optimise_poles(
     bank = Orthonormal(poles0, first)
     chosen = Volterra(bank, degrees=degrees, constant=constant)
     repeat = whole(repeat, "repeat", 1)
-    z, signs = coordinates(bank.kinds, np.asarray(bank.numbers))
+    z, signs = coordinates(bank.kinds, np.asarray(bank.parameters))
     rng = np.random.default_rng(checked_seed(seed))
     shifts = spread * rng.standard_normal((whole(starts, "starts", 1), len(z)))
     shifts[0] = 0.0

@@ -57,8 +57,8 @@ def _run_responses(
     samples: ProgramSamples,
 ) -> RunResponses:
     def one(values: Any, x0: Any, K: Any, *samples: Any) -> RunResponses:
-        numbers = RunParameters(values, parameter_set.gates, x0, K)
-        return run_responses(structure, solver, ports, numbers, RecordingSamples(*samples))
+        parameters = RunParameters(values, parameter_set.gates, x0, K)
+        return run_responses(structure, solver, ports, parameters, RecordingSamples(*samples))
 
     p, (data, window, _) = parameter_set, samples
     return each_recording(one, (0,) * 8)(p.values, p.x0, p.K, *data, window)
@@ -74,8 +74,8 @@ def _friction_responses(
     X: jax.Array,
 ) -> PortResponses:
     def one(values: Any, x0: Any, K: Any, X: Any, *samples: Any) -> PortResponses:
-        numbers = RunParameters(values, parameter_set.gates, x0, K)
-        return friction_responses(structure, solver, ports, numbers, RecordingSamples(*samples), X)
+        parameters = RunParameters(values, parameter_set.gates, x0, K)
+        return friction_responses(structure, solver, ports, parameters, RecordingSamples(*samples), X)
 
     p, (data, window, _) = parameter_set, samples
     return each_recording(one, (0,) * 9)(p.values, p.x0, p.K, X, *data, window)
@@ -136,8 +136,8 @@ def _inactive_slopes(
 ) -> jax.Array:
     def one(values: Any, x0: Any, K: Any, run: Any, dvalues: Any, *samples: Any) -> Any:
         rest = jnp.broadcast_to(rest_state(structure, np.float64), (len(x0), K.shape[0]))
-        numbers = RunParameters(values, parameter_set.gates, rest.at[:, present].set(x0), K)
-        given = (numbers, RecordingSamples(*samples), present, run, dvalues, directions.gates)
+        parameters = RunParameters(values, parameter_set.gates, rest.at[:, present].set(x0), K)
+        given = (parameters, RecordingSamples(*samples), present, run, dvalues, directions.gates)
         return inactive_sensitivities(structure, solver, inactive, *given)
 
     data, window, _ = samples

@@ -197,7 +197,7 @@ def next_experiment(
         Ts=Ts,
         period=P * Ts if chosen.input == "design" else N * Ts,
         table=tuple(rated for rated, _, _ in table),
-        numbers={model.label: {n: float(v) for n, v in model.effect().values.items()} for model in pair},
+        parameters={model.label: {n: float(v) for n, v in model.effect().values.items()} for model in pair},
         outputs=result.outputs,
         differences=np.einsum("knc,kdc->knd", whitened, L),
         channels=fitted.mechanism.channels,

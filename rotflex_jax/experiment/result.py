@@ -103,7 +103,7 @@ class Experiment:
         Ts: Sampling period [s].
         period: Time after which the input repeats [s]; its whole length if it does not repeat.
         table: Standard inputs and designs, best first.
-        numbers: Effect -> its parameters.
+        parameters: Effect -> its parameters.
         outputs: Runs if the first effect is true, and if the second effect is true.
         differences: Residuals of the rival fitted to each run, in units of the outputs.
         channels: Names of the outputs.
@@ -120,7 +120,7 @@ class Experiment:
     Ts: float
     period: float
     table: tuple[Rated, ...]
-    numbers: dict[str, dict[str, float]]
+    parameters: dict[str, dict[str, float]]
     outputs: Float[np.ndarray, "2 N C"]
     differences: Float[np.ndarray, "2 N C"]
     channels: tuple[str, ...]
@@ -180,7 +180,7 @@ class Experiment:
             "evidence": self.evidence,
             "expected": self.chosen.to_dict(),
             "table": [r.to_dict() for r in self.table],
-            "effects": self.numbers,
+            "effects": self.parameters,
             "limits": json_limits(self.limits),
             "noise": self.noise,
             "notes": list(self.notes),

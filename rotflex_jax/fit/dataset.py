@@ -148,7 +148,7 @@ def with_common_constants(model: Model, recordings: Sequence[Recording]) -> Mode
     if np.any(differ):
         names = [n for n, d in zip(model.mechanism.parameter_names, differ, strict=True) if d]
         raise InputError(
-            f"The recordings differ in {', '.join(names)}, but here all share one set of numbers; give "
+            f"The recordings differ in {', '.join(names)}, but here all share one set of constants; give "
             "recordings with the same constants, or use `fit`."
         )
     return model.at(recordings[0])

@@ -102,7 +102,9 @@ class Identifiability:
     @property
     def sentences(self) -> tuple[str, ...]:
         """All results in words."""
-        how = "in exact arithmetic" if self.exact else "by the rank of sensitivities at random numbers"
+        how = (
+            "in exact arithmetic" if self.exact else "by the rank of sensitivities at random parameter values"
+        )
         said = []
         if self.structural:
             said.append(f"A perfect recording would determine all {len(self.free)} free parameters ({how}).")

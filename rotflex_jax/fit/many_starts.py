@@ -171,8 +171,10 @@ def _minimise_each(
         gates = jnp.ones(len(structure.effects), p.dtype)
 
         def run(r: Any) -> NormalEquations:
-            numbers = RunParameters(p, gates, whole_state(structure, r[0]), None)
-            return normal_equations(structure, solver, numbers, ways, RecordingSamples(*r[1]), inputs.scale)
+            parameters = RunParameters(p, gates, whole_state(structure, r[0]), None)
+            return normal_equations(
+                structure, solver, parameters, ways, RecordingSamples(*r[1]), inputs.scale
+            )
 
         return JointEquations(jax.lax.map(run, (x0, tuple(inputs.data))))
 

@@ -101,7 +101,7 @@ def each_recording(run: Callable[..., Any], in_axes: tuple[int | None, ...], out
 def normal_equations(
     structure: Mechanism,
     solver: Solver,
-    numbers: RunParameters,
+    parameters: RunParameters,
     ways: TangentDirections,
     samples: RecordingSamples,
     scale: Float[Array, " C"],
@@ -111,7 +111,7 @@ def normal_equations(
     Args:
         structure: Mechanism without values; static.
         solver: Integration rule; static.
-        numbers: Parameters, first states and gain; a free run if the gain is None.
+        parameters: Parameters, first states and gain; a free run if the gain is None.
         ways: The D directions.
         samples: The recording.
         scale: Size of the error of each channel.
@@ -131,7 +131,7 @@ def normal_equations(
 
     D, dtype = len(ways.x0), samples.u.dtype
     none = NormalEquations(jnp.zeros(len(scale), dtype), jnp.zeros(D, dtype), jnp.zeros((D, D), dtype))
-    return accumulate_outputs(structure, solver, numbers, ways, samples, fold, none)[0]
+    return accumulate_outputs(structure, solver, parameters, ways, samples, fold, none)[0]
 
 
 def directions(
@@ -198,8 +198,10 @@ def runs_with_slopes(
         values, slopes, x0, K, samples = row
         gates = jnp.ones(len(structure.effects), values.dtype)
         ways = directions(structure, slopes, free, layout.states)
-        numbers = RunParameters(values, gates, whole_state(structure, x0), K)
-        return outputs_with_sensitivities(structure, layout.solver, numbers, ways, RecordingSamples(*samples))
+        parameters = RunParameters(values, gates, whole_state(structure, x0), K)
+        return outputs_with_sensitivities(
+            structure, layout.solver, parameters, ways, RecordingSamples(*samples)
+        )
 
     samples = tuple(data) if window is None else (*data, window)
     rows = (values, slopes, x0, K, samples)

@@ -44,14 +44,14 @@ def _model(text: str) -> Any:
 
     name, separator, values = text.partition(":")
     if name.endswith(".xml"):
-        named_joints = _numbers(values, ("joint", "child"), f"option of {name}")
+        named_joints = _options(values, ("joint", "child"), f"option of {name}")
         return Model(joints.load_mjcf(name, **{key: str(value) for key, value in named_joints.items()}))
     if text.endswith(".json") or (separator and "=" not in values and name not in JOINTS):
         return named(text)
     preset = getattr(joints, choose(name, JOINTS, "joint"))
     # A motor or a servo is not a number: another one has to be given in Python.
     names = [key for key in inspect.signature(preset).parameters if key not in ("motor", "servo")]
-    return Model(preset(**_numbers(values, names, f"option of {name}")))
+    return Model(preset(**_options(values, names, f"option of {name}")))
 
 
 def named(text: str) -> Any:
@@ -143,11 +143,11 @@ def effect(text: str) -> Any:
             f"The effect {name} was given no port, but can act at {', '.join(ports)}; give for "
             f"instance {name}@{ports[0]}."
         )
-    numbers = _numbers(values, kind.declared(), f"parameter of {name}")
-    return kind(at=port or ports[0], **numbers)
+    parameters = _options(values, kind.declared(), f"parameter of {name}")
+    return kind(at=port or ports[0], **parameters)
 
 
-def _numbers(text: str, names: Iterable[str], what: str) -> dict[str, Any]:
+def _options(text: str, names: Iterable[str], what: str) -> dict[str, Any]:
     """`a=1,b=C` as a dict; a value that is no number stays text."""
     found: dict[str, Any] = {}
     for pair in filter(None, text.split(",")):

@@ -452,13 +452,13 @@ class Mechanism:
         listed: Any = values.tolist() if isinstance(values, np.ndarray) else values
         if isinstance(values, jax.Array):  # all at once, which traces many times faster than one by one
             listed = jnp.unstack(values)
-        return self._with_numbers(listed, self.trusted)
+        return self._with_parameters(listed, self.trusted)
 
-    def _with_numbers(self, numbers: Sequence[Any], trusted: frozenset[str]) -> "Mechanism":
-        """The same mechanism with other numbers in its effects, without the checks of a new mechanism."""
+    def _with_parameters(self, parameters: Sequence[Any], trusted: frozenset[str]) -> "Mechanism":
+        """The same mechanism with other parameters in its effects, without the checks of a new mechanism."""
         effects, start = [], 0
         for e in self.effects:
-            part = {n: numbers[start + i] for i, n in enumerate(e.values)}
+            part = {n: parameters[start + i] for i, n in enumerate(e.values)}
             effects.append(e.replace(**part))
             start += len(part)
         rebuilt = object.__new__(type(self))
@@ -498,7 +498,7 @@ class Mechanism:
     def tree_unflatten(cls, aux: Any, leaves: Sequence[Any]) -> "Mechanism":
         """The mechanism with these leaves (numbers or tracers)."""
         structure, trusted = aux
-        return structure._with_numbers(leaves, trusted)
+        return structure._with_parameters(leaves, trusted)
 
     def _status(self, name: str) -> str:
         if name in self.followers:

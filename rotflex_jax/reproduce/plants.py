@@ -106,14 +106,14 @@ SCENARIOS: dict[str, Scenario] = {
 """Name -> scenario."""
 
 
-def plant(name: str, arm_friction: str = "joint", **numbers: Any) -> Mechanism:
+def plant(name: str, arm_friction: str = "joint", **parameters: Any) -> Mechanism:
     """The mechanism of a scenario.
 
     Args:
         name: One of `SCENARIOS`.
         arm_friction: Port of the arm's friction: "joint", the bearing between hub and arm, or "arm",
             against the table. The paper's "rotational speeds of the two rotating masses" allows both.
-        **numbers: Arguments of `joints.paper`, for instance `efficiency=0.621`.
+        **parameters: Arguments of `joints.paper`, for instance `efficiency=0.621`.
 
     Returns:
         The paper's joint with the effects of the scenario, outputs `theta` and `alpha`.
@@ -134,8 +134,8 @@ def plant(name: str, arm_friction: str = "joint", **numbers: Any) -> Mechanism:
             "hub) or at 'arm' (against the table); choose one of these."
         )
     if name == "S5p":
-        numbers.setdefault("stiffness", spring_series(3, 2, "C", 3)[1])
-    mechanism = paper(**numbers)
+        parameters.setdefault("stiffness", spring_series(3, 2, "C", 3)[1])
+    mechanism = paper(**parameters)
     for effect in SCENARIOS[name].effects(arm_friction):
         mechanism = mechanism + effect
     return mechanism

@@ -133,7 +133,7 @@ class Settings:
     plant: tuple[tuple[str, float], ...] = setting(
         (),
         ASSUMPTION,
-        "other numbers of the machine by their full names, such as hub.coulomb.level=0.05; no friction or "
+        "other parameters of the machine by their full names, such as hub.coulomb.level=0.05; no friction or "
         "dead zone of this module has been published",
     )
     efficiency: float = setting(
@@ -259,10 +259,10 @@ class Settings:
         (1, 2)
         """
         fields = {field.name: field for field in dataclasses.fields(self)}
-        numbers = {name: value for name, value in changes.items() if "." in name}
-        changes = {name: value for name, value in changes.items() if name not in numbers}
-        if numbers:
-            changes["plant"] = tuple((dict(self.plant) | numbers).items())
+        parameters = {name: value for name, value in changes.items() if "." in name}
+        changes = {name: value for name, value in changes.items() if name not in parameters}
+        if parameters:
+            changes["plant"] = tuple((dict(self.plant) | parameters).items())
         for name in changes:
             if name not in fields:
                 raise InputError(
@@ -390,5 +390,5 @@ def machine_rows(s: Settings) -> list[dict[str, Any]]:
 
 
 def _scenario(s: Settings) -> Mechanism:
-    numbers = {"efficiency": s.efficiency, "inductance": s.inductance or None}
-    return plant(s.scenario, s.arm_friction, **numbers) + Saturation(limit=s.saturation)
+    parameters = {"efficiency": s.efficiency, "inductance": s.inductance or None}
+    return plant(s.scenario, s.arm_friction, **parameters) + Saturation(limit=s.saturation)

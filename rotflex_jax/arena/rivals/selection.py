@@ -37,10 +37,10 @@ class Regression(NamedTuple):
     base: Values
     columns: Sequence[Values]
 
-    def left(self, chosen: Sequence[int], numbers: Values) -> float:
+    def left(self, chosen: Sequence[int], coefficients: Values) -> float:
         """Mean square of the residuals with the given coefficients, which may come from other data."""
         X = np.hstack([self.base, *(self.columns[i] for i in chosen)])
-        return float(np.mean((self.target - X @ numbers) ** 2))
+        return float(np.mean((self.target - X @ coefficients) ** 2))
 
     def fitted(self, chosen: Sequence[int]) -> Values:
         """Coefficients of the base and of the chosen candidates, by least squares."""
@@ -79,8 +79,8 @@ def select(train: Regression, validation: Regression, candidates: Sequence[Torqu
                 continue
             q = np.linalg.qr(c[:, kept])[0]
             share = float(np.sum((q.T @ left) ** 2) / np.sum(left**2))
-            numbers = c.shape[1] + bool(term.shape)
-            nats = -0.5 * samples * np.log1p(-min(share, 1 - 1e-12)) - 0.5 * numbers * np.log(samples)
+            count = c.shape[1] + bool(term.shape)
+            nats = -0.5 * samples * np.log1p(-min(share, 1 - 1e-12)) - 0.5 * count * np.log(samples)
             trials.append((nats, term, q))
         gain, best, direction = max(trials, key=lambda t: t[0])
         if gain < MARGIN:
