@@ -241,6 +241,6 @@ def test_a_step_that_takes_long_is_said_again(impatient: None, capsys: pytest.Ca
 def test_a_long_line_is_shortened_when_it_is_said_again(
     impatient: None, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    told = terminal._Told("Searching")
+    told = terminal._LastLine("Searching")
     told.take("refitting " + ", ".join(f"effect{k} at hub" for k in range(20)))
     assert " … (0 s" in told.again() and len(told.again()) < 110

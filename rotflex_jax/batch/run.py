@@ -87,8 +87,8 @@ def fleet(
     places = places_of(model, search, far=scheduler is not None)
     units = output_units(model.mechanism)
     column = reading.get("input")  # `load` refuses what is no word
-    told = units_to_read(model.mechanism, column if isinstance(column, str) else None)
-    reading = {"outputs": {c: c for c in units}, "units": told, **reading}
+    to_read = units_to_read(model.mechanism, column if isinstance(column, str) else None)
+    reading = {"outputs": {c: c for c in units}, "units": to_read, **reading}
     task = SearchTask(Path(), reading, split, _pickled(model, search), places, pages)
     common = storage.digest_of_search(model, search, split, reading, places)
     batch = BatchProgress(sources, task, common, storage.created(folder, pages), progress)

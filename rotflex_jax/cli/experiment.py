@@ -233,12 +233,12 @@ def _report(e: Any, state: Path, save: Path | None, json_file: Path | None) -> N
         voltage = save or _voltage_file(state, len(e.history) + 1)
         e.planned.save_csv(voltage)
     e.save(state)
-    told = result.to_dict() | {
+    data = result.to_dict() | {
         "state": str(state),
         "next": None if e.planned is None else e.planned.to_dict(str(voltage)),
     }
     if json_file == given.STDOUT:
-        print(json.dumps(told, indent=2), flush=True)
+        print(json.dumps(data, indent=2), flush=True)
         return
     terminal.output().print(str(result) if e.planned is None else result.sentence, markup=False)
     if e.planned is not None:
@@ -248,7 +248,7 @@ def _report(e: Any, state: Path, save: Path | None, json_file: Path | None) -> N
             f"rotflex experiment --continue {state} RECORDING"
         )
     if json_file is not None:
-        write_file(json_file, json.dumps(told, indent=2) + "\n")
+        write_file(json_file, json.dumps(data, indent=2) + "\n")
 
 
 def _voltage_file(state: Path, count: int) -> Path:

@@ -118,9 +118,9 @@ class Columns:
         from rotflex_jax.models.model import units_to_read
 
         units = {} if self.mechanism is None else units_to_read(self.mechanism, self.input)
-        channels, told = _channels(self.outputs or (), self.mechanism.channels if self.mechanism else ())
+        channels, own = _channels(self.outputs or (), self.mechanism.channels if self.mechanism else ())
         named = (*named_outputs(channels), self.input)
-        units = {name: unit for name, unit in units.items() if name in named} | told
+        units = {name: unit for name, unit in units.items() if name in named} | own
         return {
             "input": self.input,
             "outputs": channels,

@@ -46,7 +46,7 @@ def output() -> Console:
     return console if console.is_terminal else SafeConsole(highlight=False, soft_wrap=True, width=160)
 
 
-class _Told:
+class _LastLine:
     """The last line of progress, and the time since it was shown."""
 
     def __init__(self, title: str) -> None:
@@ -89,28 +89,28 @@ def progress(title: str) -> Iterator[Callable[[str], None]]:
     Yields:
         The function to call with one short phrase per step.
     """
-    console, told, ended = SafeConsole(stderr=True, highlight=False), _Told(title), threading.Event()
+    console, last, ended = SafeConsole(stderr=True, highlight=False), _LastLine(title), threading.Event()
     if console.is_terminal:
         with console.status(title) as status:
             show, every = lambda text: status.update(cell(text)), 1.0
-            with _repeating(told, show, every, ended):
-                yield lambda step: show(told.take(step))
+            with _repeating(last, show, every, ended):
+                yield lambda step: show(last.take(step))
         return
     show = lambda text: console.print(text, markup=False, soft_wrap=True)  # noqa: E731
-    with _repeating(told, show, SILENCE, ended):
-        yield lambda step: show(told.take(step))
+    with _repeating(last, show, SILENCE, ended):
+        yield lambda step: show(last.take(step))
 
 
 @contextmanager
 def _repeating(
-    told: _Told, show: Callable[[str], None], every: float, ended: threading.Event
+    last: _LastLine, show: Callable[[str], None], every: float, ended: threading.Event
 ) -> Iterator[None]:
     """Repeats the last line whenever nothing was shown for `every` seconds."""
 
     def watch() -> None:
         while not ended.wait(min(every / 4, 1.0)):
-            if time.monotonic() - told.shown >= every:
-                show(told.again())
+            if time.monotonic() - last.shown >= every:
+                show(last.again())
 
     watcher = threading.Thread(target=watch, daemon=True)
     watcher.start()
@@ -203,8 +203,8 @@ def print_discovery(result: Any) -> None:
         ):
             console.print(f"\n{heading}")
             console.print(error_table([*each, floor], units))
-    if told := final_fit_sentence(result):
-        console.print(f"\n{told}", markup=False)
+    if sentence := final_fit_sentence(result):
+        console.print(f"\n{sentence}", markup=False)
     if result.where:
         console.print("\nWhere the baseline failed", style="bold")
         console.print(where_sentence(result), markup=False)

@@ -101,8 +101,8 @@ def read_table(source: Any, max_bytes: int = MAX_BYTES, time: str | None = None)
         except InputError as error:
             if not files:
                 raise
-            told = f"The folder {folder!s:.100} as one recording with a file for each channel: {error}"
-            raise InputError(told) from error
+            message = f"The folder {folder!s:.100} as one recording with a file for each channel: {error}"
+            raise InputError(message) from error
     path = readable_file(source)
     reader = READERS.get(path.suffix.lower())
     if reader is None:
@@ -360,8 +360,8 @@ def load(
     y, unit_of, turned = {}, {}, set()  # the last: channels that have been converted
     for channel, name in chosen.items():
         values = column_of(table, name, "outputs=", {})
-        told = (units or {}).get(channel), degrees, per_turn.get(channel)
-        y[channel], unit_of[channel] = output(table, channel, name, values, *told, accepted)
+        conversion = (units or {}).get(channel), degrees, per_turn.get(channel)
+        y[channel], unit_of[channel] = output(table, channel, name, values, *conversion, accepted)
         if y[channel] is not values:
             turned.add(channel)
     for name, values in zip(names, [*held, *y.values()], strict=True):
@@ -397,9 +397,9 @@ def load(
             )
             for k, (name, x) in enumerate(zip(names, [*held, *y.values()], strict=True))
         ]
-        start, period, brought, told = resampled_apart(timed, resample, table.where, table.first)
+        start, period, brought, remark = resampled_apart(timed, resample, table.where, table.first)
         held, together = [x[:, 0] for x in brought[: len(held)]], np.column_stack(brought[len(held) :])
-        remarks.append(told)
+        remarks.append(remark)
     elif resample is None:
         together = np.column_stack(list(y.values()))
         start, period = timing(table, clock, time, Ts, time_unit, len(u), "units" in accepted)
@@ -407,9 +407,9 @@ def load(
         together = np.column_stack(list(y.values()))
         t = time_stamps(table, clock, time_unit, len(u), "units" in accepted)
         at = f"{table.label}: the time {clock!r}", table.where, table.first
-        start, period, steps, together, told = resampled(t, np.column_stack(held), together, resample, *at)
+        start, period, steps, together, remark = resampled(t, np.column_stack(held), together, resample, *at)
         held = list(steps.T)
-        remarks.append(told)
+        remarks.append(remark)
     # A user who gives the unit of the time means a long period; a column of times has been checked above.
     seconds = period >= SLOWEST_SAMPLING and (time_unit is not None or "units" in accepted)
     driven_in = (units or {}).get(u_name) or (units or {}).get(given_as)
@@ -434,8 +434,8 @@ def load(
     for finding in recording.findings:
         # Columns of a file are less certain than arrays, whose meaning the calling program knows.
         if finding.kind in DOUBTED and finding.kind not in accepted:
-            told = converted(finding) if finding.channel in turned else finding
-            raise InputError(f"{table.label}: {told.message}")
+            worded = converted(finding) if finding.channel in turned else finding
+            raise InputError(f"{table.label}: {worded.message}")
     if table.cut:  # a finding on the file, not on parts of the recording
         cut = Finding("cut", [*table.columns][-1], table.cut, "note")
         vars(recording)["findings"] = (*recording.findings, cut)

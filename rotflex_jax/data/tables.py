@@ -181,13 +181,13 @@ def table_from_text(path: Path, max_bytes: int = MAX_BYTES) -> Table:
     """
     text = _decoded(path, max_bytes)
     lines = text.splitlines()
-    told = re.fullmatch(r"sep=(.)", lines[0]) if lines else None
-    if told:
+    declared = re.fullmatch(r"sep=(.)", lines[0]) if lines else None
+    if declared:
         lines[0] = ""
     start = _header(lines)
     if start is None:
         raise InputError(f"{path.name} has no text in it; export the recording again.")
-    delimiter = told[1] if told else next((mark for mark in "\t;|," if mark in lines[start]), None)
+    delimiter = declared[1] if declared else next((mark for mark in "\t;|," if mark in lines[start]), None)
     names = [name.strip() for name in _cells(lines[start].lstrip("#% "), delimiter)]
     if _are_numbers(names):
         raise InputError(
@@ -502,14 +502,14 @@ def resampled_apart(
     repeated = sum(int(np.sum(~keep)) for _, _, keep in clocks.values())
     shortest = min(steps.min() for _, steps, _ in clocks.values())
     longest = max(steps.max() for _, steps, _ in clocks.values())
-    told = f"Resampled every {Ts:g} s from steps of {shortest:.4g} to {longest:.4g} s"
+    message = f"Resampled every {Ts:g} s from steps of {shortest:.4g} to {longest:.4g} s"
     if len(clocks) > 1:
-        told += f" of {len(clocks)} clocks"
+        message += f" of {len(clocks)} clocks"
     if lost:
-        told += f"; about {lost} rows are lost, and lines bridge them"
+        message += f"; about {lost} rows are lost, and lines bridge them"
     if repeated:
-        told += f"; {repeated} rows with a time that was there before are left out"
-    finding = Finding("resampled", "time", f"{told}.", "warning" if lost else "note")
+        message += f"; {repeated} rows with a time that was there before are left out"
+    finding = Finding("resampled", "time", f"{message}.", "warning" if lost else "note")
     return start, Ts, found, finding
 
 

@@ -319,5 +319,5 @@ class Discovery(SearchResult):
             ),
             folded("Where the baseline failed", where),
             folded("Ranking before any was added", table(("candidate", "", "score [nat]"), ranked, words=2)),
-            bullets([*([told] if (told := final_fit_sentence(self)) else []), *notes_in_words(self)]),
+            bullets([*([fitted] if (fitted := final_fit_sentence(self)) else []), *notes_in_words(self)]),
         )

@@ -2,7 +2,7 @@
 
 As in `Model.simulate_windows`, positions and speeds at the start of a window come from its first samples. For
 states that no sensor measures, values are given here, while `Model.simulate_windows` takes them from a run
-over the whole recording. That method is not used here, since it would be compiled anew for every candidate.
+over the whole recording. That method is not used here, since it would be compiled again for every candidate.
 """
 
 import dataclasses

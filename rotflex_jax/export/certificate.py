@@ -181,7 +181,7 @@ class Subject:
         """
         m = self.mechanism
         units = tuple(q.unit(m.units) for q in m.quantities)
-        told = Certificate(
+        certified = Certificate(
             form,
             simulated_by,
             why_not,
@@ -192,11 +192,11 @@ class Subject:
             approximated=tuple(approximated),
         )
         if y is None:
-            return told
+            return certified
         own = simulate(m, self.u, self.Ts, solver=self.model.solver)
         apart = np.abs(y - own)
         return dataclasses.replace(
-            told,
+            certified,
             largest=tuple(apart.max(axis=0).tolist()),
             rms=tuple(np.sqrt(np.mean(apart**2, axis=0)).tolist()),
             spans=tuple(np.ptp(own, axis=0).tolist()),

@@ -110,12 +110,12 @@ def run_in_fmpy(
     with tempfile.TemporaryDirectory() as folder:
         with zipfile.ZipFile(io.BytesIO(fmu)) as archive:
             archive.extractall(folder)
-        told = reader.read_model_description(folder)
-        outputs = [v.valueReference for v in told.modelVariables if v.causality == "output"]
+        description = reader.read_model_description(folder)
+        outputs = [v.valueReference for v in description.modelVariables if v.causality == "output"]
         unit = slave.FMU3Slave(
-            guid=told.guid,
+            guid=description.guid,
             unzipDirectory=folder,
-            modelIdentifier=told.coSimulation.modelIdentifier,
+            modelIdentifier=description.coSimulation.modelIdentifier,
             instanceName="certificate",
         )
         unit.instantiate()
@@ -174,7 +174,7 @@ def _compiled(identifier: str, header: str, wrapper: str) -> bytes | None:
         if done.returncode:
             raise InputError(
                 f"The C compiler {os.path.basename(compiler)} did not accept the source of {identifier}: "
-                f"{one_line(done.stderr.strip())[:300]}; mend the compiler, or take it off the path for an "
+                f"{one_line(done.stderr.strip())[:300]}; repair the compiler, or take it off the path for an "
                 "FMU of source alone."
             )
         return Path(folder, "model.so").read_bytes()
@@ -229,8 +229,8 @@ def _description(subject: Subject, name: str, identifier: str, token: str) -> ET
     )
     variables = ET.SubElement(root, "ModelVariables")
     for reference, (variable, unit, kind) in enumerate(listed):
-        told = {"name": variable, "valueReference": str(reference), "unit": unit}
-        ET.SubElement(variables, "Float64", told | kind)
+        attributes = {"name": variable, "valueReference": str(reference), "unit": unit}
+        ET.SubElement(variables, "Float64", attributes | kind)
     structure = ET.SubElement(root, "ModelStructure")
     outputs = [str(2 + k) for k in range(len(m.channels))]
     for reference in outputs:

@@ -142,7 +142,7 @@ class _Reader:
 
     def mechanism(self) -> Mechanism:
         """The mechanism."""
-        hub, arm, told = self.hub, self.arm, self.file.number
+        hub, arm, number = self.hub, self.arm, self.file.number
         self._check_options()
         bodies = self.file.below(hub.body)
         outer = [] if arm is None else self.file.below(arm.body)
@@ -150,12 +150,12 @@ class _Reader:
         self._check_masses(hub, inner)
         if arm is not None:
             self._check_masses(arm, outer)
-        armature = told(hub.told, "armature")
+        armature = number(hub.attributes, "armature")
         self.effects.append(Inertia(at=self.port, inertia=self._inertia(inner) + armature))
         if arm is not None:
             self.effects.append(Inertia(at="arm", inertia=self._inertia(outer)))
-            if told(arm.told, "armature"):
-                self.effects.append(Inertia(at="joint", inertia=told(arm.told, "armature")))
+            if number(arm.attributes, "armature"):
+                self.effects.append(Inertia(at="joint", inertia=number(arm.attributes, "armature")))
         damping = self._own_damping(hub)
         damping = self._drive(damping)
         self.effects.append(Viscous(at=self.port, coefficient=damping))
@@ -218,10 +218,10 @@ class _Reader:
 
     def _weight(self, bodies: list[int], port: str) -> None:
         """Torque of the weight, axis . (turn(q) r x m g): a cosine and a sine of the angle."""
-        told = self.file.options
+        attributes = self.file.options
         if self.file.flags.get("gravity") == "disable":
             return
-        fall, axis = self.file.numbers(told, "gravity", 3, np.array([0.0, 0.0, -9.81])), self.hub.axis
+        fall, axis = self.file.numbers(attributes, "gravity", 3, np.array([0.0, 0.0, -9.81])), self.hub.axis
         cosine = sine = size = 0.0
         for b in (self.file.bodies[k] for k in bodies):
             pull, lever = b.mass * fall, b.centre - self.hub.anchor
@@ -238,16 +238,16 @@ class _Reader:
     def _own_damping(self, joint: FileJoint) -> float:
         """Damping of a joint; refuses entries of the joint that no effect can represent."""
         for name in ("springdamper", "springyield", "actuatorgravcomp"):
-            if any(x not in ("0", "0.0", "false") for x in joint.told.get(name, "0").split()):
+            if any(x not in ("0", "0.0", "false") for x in joint.attributes.get(name, "0").split()):
                 self.unable(f"{name} at the joint {one_line(joint.name)!r}", name)
-        if self.file.number(joint.told, "ref"):
+        if self.file.number(joint.attributes, "ref"):
             self.unable(f"a reference angle (ref) at the joint {one_line(joint.name)!r}", "ref")
-        return self.file.number(joint.told, "damping")
+        return self.file.number(joint.attributes, "damping")
 
     def _contact(self, joint: FileJoint, port: str, always: bool = False) -> None:
         """Spring and dry friction of a joint."""
-        stiffness, level = (self.file.number(joint.told, n) for n in ("stiffness", "frictionloss"))
-        if stiffness and self.file.number(joint.told, "springref"):
+        stiffness, level = (self.file.number(joint.attributes, n) for n in ("stiffness", "frictionloss"))
+        if stiffness and self.file.number(joint.attributes, "springref"):
             self.unable(
                 f"a spring away from zero (springref) at the joint {one_line(joint.name)!r}", "springref"
             )
@@ -273,18 +273,18 @@ class _Reader:
                     j.get("joint"): self.file.number(dict(j.attrib), "coef", 1.0)
                     for j in element.findall("joint")
                 }
-                told = self.file.told(element, None, "tendon")
+                attributes = self.file.attributes_of(element, None, "tendon")
                 keys = ("stiffness", "damping", "frictionloss", "armature")
-                k, d, level, inertia = (self.file.number(told, n) for n in keys)
+                k, d, level, inertia = (self.file.number(attributes, n) for n in keys)
                 if element.tag == "spatial" or (names & set(shares) and not set(shares) <= names):
-                    self.unable(f"the tendon {one_line(told.get('name', ''))!r}", "tendon")
+                    self.unable(f"the tendon {one_line(attributes.get('name', ''))!r}", "tendon")
                     continue
                 if not names & set(shares) or not any((k, d, level, inertia)):
                     continue
                 own = tuple(shares.get(j.name, 0.0) for j in (self.hub, self.arm) if j is not None)
-                rest = self.file.numbers(told, "springlength", None, np.zeros(1))
+                rest = self.file.numbers(attributes, "springlength", None, np.zeros(1))
                 if own != (1.0, self.side) or (k and np.any(rest)):
-                    self.unable(f"the tendon {one_line(told.get('name', ''))!r}", "tendon")
+                    self.unable(f"the tendon {one_line(attributes.get('name', ''))!r}", "tendon")
                     continue
                 self._join(Spring(at="arm", stiffness=k), bool(k))
                 self._join(Viscous(at="arm", coefficient=d), bool(d))
@@ -308,11 +308,13 @@ class _Reader:
         tied = {t.get("name") for t in fixed if names & {j.get("joint") for j in t.findall("joint")}} - {None}
         for group in self.file.root.findall("actuator"):
             for element in group:
-                told = self.file.told(element, None, "general")
-                at = told.get("joint", told.get("jointinparent"))
+                attributes = self.file.attributes_of(element, None, "general")
+                at = attributes.get("joint", attributes.get("jointinparent"))
                 mine += [element] if at == self.hub.name else []
-                if told.get("tendon") in tied:
-                    self.unable(f"an actuator at the tendon {one_line(str(told['tendon']))!r}", "actuator")
+                if attributes.get("tendon") in tied:
+                    self.unable(
+                        f"an actuator at the tendon {one_line(str(attributes['tendon']))!r}", "actuator"
+                    )
                 if at in names and at != self.hub.name:
                     self.unable(
                         f"an actuator at the joint {one_line(str(at))!r}, behind the first", "actuator"
@@ -329,27 +331,29 @@ class _Reader:
         file, kind = self.file, element.tag
         known = ("motor", "general", "position", "velocity", "dcmotor")
         # MuJoCo keeps one set of defaults for all actuators; gains belong to one kind of actuator.
-        every = file.told(element, None, *known)
-        told = file.told(element, None, "general") | {n: every[n] for n in _OF_ALL_KINDS & set(every)}
+        every = file.attributes_of(element, None, *known)
+        attributes = file.attributes_of(element, None, "general") | {
+            n: every[n] for n in _OF_ALL_KINDS & set(every)
+        }
         if kind == "general" and {"kp", "kv"} & set(every):
             self.unable("defaults of another kind for a <general> actuator", "actuator law")
-        gear = float(file.numbers(told, "gear", None, np.ones(1))[0])
+        gear = float(file.numbers(attributes, "gear", None, np.ones(1))[0])
         if kind not in known:
             self.unable(f"an actuator <{one_line(kind)}>", "kind of actuator")
         if kind == "dcmotor":
-            self._direct_current(told, gear)
+            self._direct_current(attributes, gear)
             return damping
         for name in ("armature", "damping", "delay", "dampratio", "inheritrange"):
-            if any(x not in ("0", "0.0") for x in told.get(name, "0").split()):
+            if any(x not in ("0", "0.0") for x in attributes.get(name, "0").split()):
                 self.unable(f"{name} at its actuator", name)
-        gain, constant, at_position, at_speed, time = self._law(kind, told)
+        gain, constant, at_position, at_speed, time = self._law(kind, attributes)
         self._filter(time)
         if constant and gain:
             self.effects.append(VoltageOffset(offset=constant / gain))
         torque, stiffness, brake = gear * gain, -at_position * gear**2, -at_speed * gear**2
         if stiffness:
-            return self._position_loop(told, gear, torque, stiffness, brake, damping)
-        self._limits(told, gain, bool(brake or constant or time > 0))
+            return self._position_loop(attributes, gear, torque, stiffness, brake, damping)
+        self._limits(attributes, gain, bool(brake or constant or time > 0))
         if brake and torque > 0:
             self.effects.append(
                 Motor(
@@ -371,49 +375,63 @@ class _Reader:
             self.unable("an actuator whose positive control turns backwards", "negative gain")
         return torque
 
-    def _law(self, kind: str, told: dict[str, str]) -> tuple[float, float, float, float, float]:
+    def _law(self, kind: str, attributes: dict[str, str]) -> tuple[float, float, float, float, float]:
         """Gain, constant, coefficients of position and speed, and time constant of an actuator's force."""
         file = self.file
         if kind == "position":
-            stiffness = file.number(told, "kp", 1.0)
-            return stiffness, 0.0, -stiffness, -file.number(told, "kv"), file.number(told, "timeconst")
+            stiffness = file.number(attributes, "kp", 1.0)
+            return (
+                stiffness,
+                0.0,
+                -stiffness,
+                -file.number(attributes, "kv"),
+                file.number(attributes, "timeconst"),
+            )
         if kind == "velocity":
-            return file.number(told, "kv", 1.0), 0.0, 0.0, -file.number(told, "kv", 1.0), 0.0
+            return file.number(attributes, "kv", 1.0), 0.0, 0.0, -file.number(attributes, "kv", 1.0), 0.0
         if kind == "motor":
             return 1.0, 0.0, 0.0, 0.0, 0.0
-        dynamics, gains = told.get("dyntype", "none"), file.numbers(told, "gainprm", None, np.ones(1))
-        if told.get("gaintype", "fixed") != "fixed" or dynamics not in ("none", "filter", "filterexact"):
+        dynamics, gains = (
+            attributes.get("dyntype", "none"),
+            file.numbers(attributes, "gainprm", None, np.ones(1)),
+        )
+        if attributes.get("gaintype", "fixed") != "fixed" or dynamics not in (
+            "none",
+            "filter",
+            "filterexact",
+        ):
             self.unable(
-                f"an actuator of gaintype {told.get('gaintype', 'fixed')}, dyntype {dynamics}", "actuator law"
+                f"an actuator of gaintype {attributes.get('gaintype', 'fixed')}, dyntype {dynamics}",
+                "actuator law",
             )
         bias = np.zeros(3)
-        if told.get("biastype", "none") == "affine":
-            given = file.numbers(told, "biasprm", None, np.zeros(3))[:3]
+        if attributes.get("biastype", "none") == "affine":
+            given = file.numbers(attributes, "biasprm", None, np.zeros(3))[:3]
             bias[: len(given)] = given
-        elif told.get("biastype", "none") != "none":
-            self.unable(f"an actuator of biastype {one_line(told['biastype'])}", "actuator law")
+        elif attributes.get("biastype", "none") != "none":
+            self.unable(f"an actuator of biastype {one_line(attributes['biastype'])}", "actuator law")
         if bias[2] > 0 and bias[1] == -gains[0]:
             self.unable("an actuator with a damping ratio (a positive third biasprm)", "dampratio")
-        time = float(file.numbers(told, "dynprm", None, np.ones(1))[0]) if dynamics != "none" else 0.0
+        time = float(file.numbers(attributes, "dynprm", None, np.ones(1))[0]) if dynamics != "none" else 0.0
         return float(gains[0]), float(bias[0]), float(bias[1]), float(bias[2]), time
 
     def _filter(self, time: float) -> None:
         if time > 0:
             self.effects.append(Lag(time=time))
 
-    def _range(self, told: dict[str, str], name: str) -> float:
+    def _range(self, attributes: dict[str, str], name: str) -> float:
         """Half of a symmetric range; infinite if there is no range, or if it is left out."""
-        ends = self.file.numbers(told, name, 2)
-        if ends is None or told.get(name.replace("range", "limited"), "auto") == "false":
+        ends = self.file.numbers(attributes, name, 2)
+        if ends is None or attributes.get(name.replace("range", "limited"), "auto") == "false":
             return math.inf
         if ends[0] != -ends[1] or ends[1] <= 0:
             self.unable(f"an asymmetric {name} of {ends[0]:g} to {ends[1]:g}", name)
             return math.inf
         return float(ends[1]) if name not in self.ignore else math.inf
 
-    def _limits(self, told: dict[str, str], gain: float, other: bool) -> None:
+    def _limits(self, attributes: dict[str, str], gain: float, other: bool) -> None:
         """Enter the limits of control and force as one limit of the input; refuse one of an `other` force."""
-        limit, force = self._range(told, "ctrlrange"), self._range(told, "forcerange")
+        limit, force = self._range(attributes, "ctrlrange"), self._range(attributes, "forcerange")
         if math.isfinite(force) and other:
             self.unable(
                 "a forcerange at an actuator with damping, a filter or a constant of its own", "forcerange"
@@ -424,13 +442,19 @@ class _Reader:
             self.effects.insert(0, Saturation(limit=limit))
 
     def _position_loop(
-        self, told: dict[str, str], gear: float, torque: float, stiffness: float, brake: float, damping: float
+        self,
+        attributes: dict[str, str],
+        gear: float,
+        torque: float,
+        stiffness: float,
+        brake: float,
+        damping: float,
     ) -> float:
         """A position loop: linear, or a servo that includes the joint's damping if its force is limited."""
         if stiffness < 0 or torque <= 0:
             self.unable("an actuator that pushes away from its goal", "actuator law")
         self.input_unit = "m" if self.hub.slides else "rad"
-        force = self._range(told, "forcerange") * abs(gear)
+        force = self._range(attributes, "forcerange") * abs(gear)
         if math.isinf(force):
             self.effects += [
                 CurrentDrive(at=self.port, gain=torque),
@@ -455,7 +479,7 @@ class _Reader:
         )
         return min(damping, 0.0)
 
-    def _direct_current(self, told: dict[str, str], gear: float) -> None:
+    def _direct_current(self, attributes: dict[str, str], gear: float) -> None:
         file = self.file
         for name in (
             "cogging",
@@ -468,15 +492,15 @@ class _Reader:
             "armature",
             "damping",
         ):
-            if name in told and told[name] != "voltage":
+            if name in attributes and attributes[name] != "voltage":
                 self.unable(f"{name} at its dcmotor", name)
-        both = file.numbers(told, "motorconst", None, np.zeros(1))
+        both = file.numbers(attributes, "motorconst", None, np.zeros(1))
         constant = math.sqrt(float(both[0] * both[-1])) if np.all(both > 0) else 0.0
-        resistance = file.number(told, "resistance")
+        resistance = file.number(attributes, "resistance")
         if not (constant > 0 and resistance > 0):
             raise file.error("has a dcmotor without motorconst and resistance above zero", "write both")
-        inductance = float(file.numbers(told, "inductance", None, np.zeros(1))[0])
-        limit = self._range(told, "ctrlrange")
+        inductance = float(file.numbers(attributes, "inductance", None, np.zeros(1))[0])
+        limit = self._range(attributes, "ctrlrange")
         if math.isfinite(limit):
             self.effects.insert(0, Saturation(limit=limit))
         self.effects.append(

@@ -44,7 +44,7 @@ class FileJoint:
         slides: Whether the joint slides; otherwise it turns.
         axis: Unit vector of the axis.
         anchor: A point on the axis [m].
-        told: Attributes of the joint, including those of its class.
+        attributes: Attributes of the joint, including those of its class.
     """
 
     name: str
@@ -52,7 +52,7 @@ class FileJoint:
     slides: bool
     axis: Float[np.ndarray, "3"]
     anchor: Float[np.ndarray, "3"]
-    told: dict[str, str]
+    attributes: dict[str, str]
 
 
 @dataclasses.dataclass
@@ -133,7 +133,7 @@ class FileModel:
     # -- attributes --------------------------------------------------------------------------------
 
     def _read_classes(self, element: ET.Element, name: str, above: dict[str, dict[str, str]]) -> None:
-        own = {tag: dict(told) for tag, told in above.items()}
+        own = {tag: dict(attributes) for tag, attributes in above.items()}
         for child in element:
             if child.tag != "default":
                 own[child.tag] = own.get(child.tag, {}) | child.attrib
@@ -141,7 +141,7 @@ class FileModel:
         for child in element.findall("default"):
             self._read_classes(child, child.get("class", ""), own)
 
-    def told(self, element: ET.Element, childclass: str | None = None, *also: str) -> dict[str, str]:
+    def attributes_of(self, element: ET.Element, childclass: str | None = None, *also: str) -> dict[str, str]:
         """Attributes of an element with those of its class; `also` names tags whose defaults count."""
         name = element.get("class", childclass or "main")
         if name not in self.classes:
@@ -152,16 +152,16 @@ class FileModel:
             found |= known.get(tag, {})
         return found | element.attrib
 
-    def numbers(self, told: dict[str, str], name: str, count: int | None, default: Any = None) -> Any:
+    def numbers(self, attributes: dict[str, str], name: str, count: int | None, default: Any = None) -> Any:
         """Numbers of an attribute; the default if the attribute is missing.
 
         Raises:
             InputError: The attribute is not `count` finite numbers.
         """
-        if name not in told:
+        if name not in attributes:
             return default
         try:
-            found = np.array([float(x) for x in told[name].split()])
+            found = np.array([float(x) for x in attributes[name].split()])
         except ValueError:
             found = np.array([math.nan])
         if (
@@ -170,40 +170,40 @@ class FileModel:
             or (count is not None and len(found) != count)
         ):
             need = "numbers" if count is None else f"{count} finite number{'s' * (count > 1)}"
-            raise self.error(f'has {name}="{one_line(told[name])[:40]}"', f"write {need}")
+            raise self.error(f'has {name}="{one_line(attributes[name])[:40]}"', f"write {need}")
         return found
 
-    def number(self, told: dict[str, str], name: str, default: float = 0.0) -> float:
+    def number(self, attributes: dict[str, str], name: str, default: float = 0.0) -> float:
         """An attribute that is one number."""
-        found = self.numbers(told, name, 1)
+        found = self.numbers(attributes, name, 1)
         return default if found is None else float(found[0])
 
-    def _turn(self, told: dict[str, str]) -> np.ndarray:
+    def _turn(self, attributes: dict[str, str]) -> np.ndarray:
         """Rotation matrix of the orientation of an element."""
         unit = math.pi / 180 if self.degrees else 1.0
-        if "quat" in told:
-            w, *xyz = self.numbers(told, "quat", 4)
+        if "quat" in attributes:
+            w, *xyz = self.numbers(attributes, "quat", 4)
             return _turned(np.array(xyz), 2 * math.atan2(float(np.linalg.norm(xyz)), w))
-        if "axisangle" in told:
-            *axis, angle = self.numbers(told, "axisangle", 4)
+        if "axisangle" in attributes:
+            *axis, angle = self.numbers(attributes, "axisangle", 4)
             return _turned(np.array(axis), angle * unit)
-        if "euler" in told:
+        if "euler" in attributes:
             matrix = np.eye(3)
             sequence = self.settings.get("eulerseq", "xyz")
             if len(sequence) != 3 or set(sequence.lower()) - set("xyz"):
                 raise self.error(f'has eulerseq="{one_line(sequence)[:20]}"', "write three of x, y, z")
-            for letter, angle in zip(sequence, self.numbers(told, "euler", 3), strict=True):
+            for letter, angle in zip(sequence, self.numbers(attributes, "euler", 3), strict=True):
                 one = _turned(np.eye(3)["xyz".index(letter.lower())], angle * unit)
                 # Lower-case letters are axes that turn with the body.
                 matrix = matrix @ one if letter.islower() else one @ matrix
             return matrix
-        if "xyaxes" in told:
-            six = self.numbers(told, "xyaxes", 6)
+        if "xyaxes" in attributes:
+            six = self.numbers(attributes, "xyaxes", 6)
             x = _unit(six[:3])
             y = _unit(six[3:] - (six[3:] @ x) * x)
             return np.column_stack([x, y, np.cross(x, y)])
-        if "zaxis" in told:
-            return _turn_to(self.numbers(told, "zaxis", 3))
+        if "zaxis" in attributes:
+            return _turn_to(self.numbers(attributes, "zaxis", 3))
         return np.eye(3)
 
     # -- bodies ------------------------------------------------------------------------------------
@@ -211,18 +211,18 @@ class FileModel:
     def _read_body(
         self, element: ET.Element, parent: int, at: np.ndarray, turn: np.ndarray, childclass: str | None
     ) -> None:
-        told, number = dict(element.attrib), len(self.bodies)
-        childclass = told.get("childclass", childclass)
-        if self.number(told, "gravcomp"):
+        attributes, number = dict(element.attrib), len(self.bodies)
+        childclass = attributes.get("childclass", childclass)
+        if self.number(attributes, "gravcomp"):
             raise self.error("has gravcomp on a body", "leave it out")
-        at = at + turn @ (self.numbers(told, "pos", 3, np.zeros(3)))
-        turn = turn @ self._turn(told)
+        at = at + turn @ (self.numbers(attributes, "pos", 3, np.zeros(3)))
+        turn = turn @ self._turn(attributes)
         mass, centre, inertia = self._mass(element, childclass)
         inertia = turn @ inertia @ turn.T
-        name = told.get("name", f"body {number}")
+        name = attributes.get("name", f"body {number}")
         self.bodies.append(FileBody(name, parent, mass, at + turn @ (centre), inertia))
         for joint in element.findall("joint"):
-            own = self.told(joint, childclass)
+            own = self.attributes_of(joint, childclass)
             kind = own.get("type", "hinge")
             if kind not in ("hinge", "slide"):
                 continue  # has several degrees of freedom, so it cannot be chosen
@@ -243,16 +243,16 @@ class FileModel:
         """Mass, centre of mass and inertia of a body, in its frame."""
         inertial, mode = body.find("inertial"), self.settings.get("inertiafromgeom", "auto")
         if inertial is not None and mode != "true":
-            told = dict(inertial.attrib)
-            mass = self.number(told, "mass", math.nan)
+            attributes = dict(inertial.attrib)
+            mass = self.number(attributes, "mass", math.nan)
             if not mass >= 0:
                 raise self.error("has an <inertial> without a mass", 'write mass="..."')
-            matrix = self._turn(told)
-            inertia = np.diag(self.numbers(told, "diaginertia", 3, np.zeros(3)))
-            if "fullinertia" in told:
-                xx, yy, zz, xy, xz, yz = self.numbers(told, "fullinertia", 6)
+            matrix = self._turn(attributes)
+            inertia = np.diag(self.numbers(attributes, "diaginertia", 3, np.zeros(3)))
+            if "fullinertia" in attributes:
+                xx, yy, zz, xy, xz, yz = self.numbers(attributes, "fullinertia", 6)
                 inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-            return mass, self.numbers(told, "pos", 3, np.zeros(3)), matrix @ inertia @ matrix.T
+            return mass, self.numbers(attributes, "pos", 3, np.zeros(3)), matrix @ inertia @ matrix.T
         parts = [] if mode == "false" else list(self._shapes(body, childclass))
         mass = sum(m for m, _, _ in parts)
         if not mass:
@@ -268,20 +268,20 @@ class FileModel:
         self, body: ET.Element, childclass: str | None
     ) -> Iterator[tuple[float, np.ndarray, np.ndarray]]:
         for element in body.findall("geom"):
-            told = self.told(element, childclass)
-            density = self.number(told, "density", WATER)
-            if told.get("mass") is not None and not self.number(told, "mass"):
+            attributes = self.attributes_of(element, childclass)
+            density = self.number(attributes, "density", WATER)
+            if attributes.get("mass") is not None and not self.number(attributes, "mass"):
                 continue
-            if "mass" not in told and not density:
+            if "mass" not in attributes and not density:
                 continue
-            kind, size = told.get("type", "sphere"), self.numbers(told, "size", None, np.zeros(1))
-            if told.get("shellinertia") == "true":
+            kind, size = attributes.get("type", "sphere"), self.numbers(attributes, "size", None, np.zeros(1))
+            if attributes.get("shellinertia") == "true":
                 raise self.error(
                     "has a shape of which only the shell has mass", "give its body an <inertial>"
                 )
-            place, turn = self.numbers(told, "pos", 3, np.zeros(3)), self._turn(told)
-            if "fromto" in told:
-                ends = self.numbers(told, "fromto", 6)
+            place, turn = self.numbers(attributes, "pos", 3, np.zeros(3)), self._turn(attributes)
+            if "fromto" in attributes:
+                ends = self.numbers(attributes, "fromto", 6)
                 place, turn = (ends[:3] + ends[3:]) / 2, _turn_to(ends[3:] - ends[:3])
                 half = float(np.linalg.norm(ends[3:] - ends[:3])) / 2
                 size = (
@@ -290,7 +290,7 @@ class FileModel:
                     else np.array([size[0], half])
                 )
             volume, per_mass = self._solid(kind, size)
-            mass = self.number(told, "mass", density * volume)
+            mass = self.number(attributes, "mass", density * volume)
             yield mass, place, turn @ np.diag(mass * per_mass) @ turn.T
 
     def _solid(self, kind: str, size: np.ndarray) -> tuple[float, np.ndarray]:

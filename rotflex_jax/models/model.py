@@ -399,7 +399,7 @@ class Model:
 
 
 def units_to_read(mechanism: Mechanism, input: str | None = None) -> dict[str, str]:
-    """Units that `rotflex_jax.load` takes only if it is told: those that are not rad, or V for the input.
+    """Units that `rotflex_jax.load` must be given: those that are not rad, or V for the input.
 
     Args:
         mechanism: Mechanism for which a file is read.

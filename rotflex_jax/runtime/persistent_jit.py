@@ -566,8 +566,8 @@ def _processor() -> str:
     """Description of the processor, on which machine code depends."""
     known = Path("/proc/cpuinfo")
     lines = known.read_text(errors="replace").splitlines() if known.exists() else []
-    told = {line for line in lines if line.startswith(("flags", "Features", "model name", "CPU part"))}
-    return f"{platform.system()} {platform.machine()} {platform.processor()} {sorted(told)}"
+    chosen = {line for line in lines if line.startswith(("flags", "Features", "model name", "CPU part"))}
+    return f"{platform.system()} {platform.machine()} {platform.processor()} {sorted(chosen)}"
 
 
 def _unchanged() -> bool:
