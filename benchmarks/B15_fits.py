@@ -35,7 +35,7 @@ import numpy as np
 import rotflex_jax as rf
 from B0_discovery import save
 from origin import begin, part
-from rotflex_jax.arena.measured import MACHINES, Way
+from rotflex_jax.arena.measured import MACHINES, Direction
 from rotflex_jax.effects import CATALOG
 from rotflex_jax.metrics import windowed_rmse
 from rotflex_jax.recording.recording import joined
@@ -44,12 +44,12 @@ LAWS = ("coulomb", "dahl", "stribeck", "lugre")
 OFFSET, SECONDS = "input.voltage_offset.offset", 2.0
 
 
-def fits(base: rf.Model, way: Way, law: str) -> list[dict[str, Any]]:
+def fits(base: rf.Model, direction: Direction, law: str) -> list[dict[str, Any]]:
     """A model with one law of friction, fitted without and with restarts."""
     m = base.mechanism + CATALOG[law](at="hub" if "hub" in base.mechanism.port_vectors else "axis")
     if OFFSET not in m.parameter_names:
         m = m + CATALOG["voltage_offset"](at="input")
-    model, runs = rf.Model(m, base.solver), list(joined((*way.train, *way.validation)))
+    model, runs = rf.Model(m, base.solver), list(joined((*direction.train, *direction.validation)))
     how: dict[str, Any] = {"local": [OFFSET], "first": "measured", "window_seconds": SECONDS}
     rf.fit(model, runs, **how, restarts=1, max_steps=1)  # compiles the programs of both fits
     rows = []
@@ -58,8 +58,10 @@ def fits(base: rf.Model, way: Way, law: str) -> list[dict[str, Any]]:
         found = rf.fit(model, runs, **how, **options)
         seconds = time.perf_counter() - begun
         of_machine = found.model.with_values({OFFSET: 0.0})
-        simulated = [of_machine.simulate_windows(r, SECONDS) for r in way.test]
-        errors = windowed_rmse(way.test, [of_machine.measured(r) for r in way.test], simulated, SECONDS)
+        simulated = [of_machine.simulate_windows(r, SECONDS) for r in direction.test]
+        errors = windowed_rmse(
+            direction.test, [of_machine.measured(r) for r in direction.test], simulated, SECONDS
+        )
         channels = of_machine.mechanism.channels
         rows.append(
             {
@@ -127,13 +129,13 @@ def main() -> int:
         # Machines with signals have the same runs as others, and these models do not use the signals.
         if machine.with_signals or not {"hub", "axis"} & set(base.mechanism.port_vectors):
             continue
-        for way in machine.ways():
-            found = {law: fits(base, way, law) for law in LAWS}
-            results["rows"][f"{name}: {way.name}"] = found
+        for direction in machine.directions():
+            found = {law: fits(base, direction, law) for law in LAWS}
+            results["rows"][f"{name}: {direction.name}"] = found
             part(results, "rows")
             save(a.out, results)
             costs = {law: [round(f["cost"]) for f in each] for law, each in found.items()}
-            print(f"{name}: {way.name}: {json.dumps(costs)}", flush=True)
+            print(f"{name}: {direction.name}: {json.dumps(costs)}", flush=True)
     print(f"saved: {a.out}")
     return 0
 

@@ -63,11 +63,11 @@ def directions(only: list[str]) -> tuple[list[tuple[str, str]], dict[str, str]]:
         if only and not chosen:
             continue
         try:
-            ways = [w.name for w in machine.ways()]
+            directions = [d.name for d in machine.directions()]
         except (rf.InputError, OSError) as problem:
             left_out[name] = str(problem)
             continue
-        wanted += [(name, w) for w in ways if not only or name in chosen or f"{name}: {w}" in chosen]
+        wanted += [(name, w) for w in directions if not only or name in chosen or f"{name}: {w}" in chosen]
     return wanted, left_out
 
 
@@ -96,7 +96,7 @@ def side_by_side(
         return row
 
     with tempfile.TemporaryDirectory() as cache, ThreadPoolExecutor(workers) as pool:
-        running = {pool.submit(one, *way, cache): way for way in todo}
+        running = {pool.submit(one, *pair, cache): pair for pair in todo}
         for done in finished(running, until):
             yield *running[done], done.result()
 
@@ -170,16 +170,18 @@ def main() -> int:
     results["left_out"] = {**results.get("left_out", {}), **left_out}
     rows = results["rows"]
     if a.again:
-        wanted = [way for way in wanted if ": ".join(way) in rows]
+        wanted = [pair for pair in wanted if ": ".join(pair) in rows]
     current = lambda row: "error" not in row and (not a.again or row.get("code") == made["code"])  # noqa: E731
     known = {key for key, row in rows.items() if current(row) and not a.fresh}
-    todo = [way for way in wanted if ": ".join(way) not in known]
+    todo = [pair for pair in wanted if ": ".join(pair) not in known]
     print(f"{len(wanted)} directions, {len(wanted) - len(todo)} known, {len(todo)} to run", flush=True)
     until = time.monotonic() + 60 * a.minutes
     if a.workers > 1:
         done = side_by_side(todo, methods, a.workers, until)
     else:
-        done = ((*way, measured(*way, methods, not a.cold_only)) for way in todo if time.monotonic() < until)
+        done = (
+            (*pair, measured(*pair, methods, not a.cold_only)) for pair in todo if time.monotonic() < until
+        )
     for count, (machine, direction, row) in enumerate(done, 1):
         key = f"{machine}: {direction}"
         head = {"machine": machine, "direction": direction}

@@ -104,8 +104,8 @@ class Transform:
 
     def constrain(self, z: Float[Array, "*batch P"]) -> Float[Array, "*batch P"]:
         """Physical values [declared units] of the unconstrained coordinates."""
-        single, boxed, edge, way = self._kinds()
-        low, sign = jnp.asarray(edge, z.dtype), jnp.asarray(way, z.dtype)
+        single, boxed, edge, inwards = self._kinds()
+        low, sign = jnp.asarray(edge, z.dtype), jnp.asarray(inwards, z.dtype)
         span = jnp.asarray(np.where(boxed, self.upper - self.lower, 1.0), z.dtype)
         # The exponent is capped against overflow: a trial step that is refused may have any size.
         grown = jnp.exp(jnp.minimum(jnp.where(jnp.asarray(single), z, 0.0), 60.0))
@@ -116,9 +116,9 @@ class Transform:
         self, z: Float[np.ndarray, "*batch P"]
     ) -> tuple[Float[np.ndarray, "*batch P"], Float[np.ndarray, "*batch P"]]:
         """`constrain(z)` and its derivative, outside of traced code."""
-        single, boxed, edge, way = self._kinds()
+        single, boxed, edge, inwards = self._kinds()
         span = np.where(boxed, self.upper - self.lower, 1.0)
-        grown = way * np.exp(np.minimum(np.where(single, z, 0.0), 60.0))
+        grown = inwards * np.exp(np.minimum(np.where(single, z, 0.0), 60.0))
         share = scipy.special.expit(np.where(boxed, z, 0.0))
         p = np.where(single, edge + grown, z * self.typical)
         slope = np.where(single, grown, self.typical)
@@ -127,9 +127,9 @@ class Transform:
     def unconstrain(self, p: Real[np.ndarray, "*batch P"]) -> Float[np.ndarray, "*batch P"]:
         """Unconstrained coordinates of physical values; a value on its bound starts just inside."""
         p = np.asarray(p, dtype=float)
-        single, boxed, edge, way = self._kinds()
+        single, boxed, edge, inwards = self._kinds()
         z = p / self.typical
-        inside = np.maximum(way * (p - edge), 1e-3 * self.typical)
+        inside = np.maximum(inwards * (p - edge), 1e-3 * self.typical)
         z = np.where(single, np.log(inside), z)
         share = (p - np.where(boxed, edge, 0.0)) / np.where(boxed, self.upper - self.lower, 1)
         share = np.clip(share, 1e-3, 1 - 1e-3)

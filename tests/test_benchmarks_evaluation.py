@@ -83,15 +83,17 @@ def test_every_measured_machine_has_its_place():
 def test_what_judges_was_not_learnt_from():
     """Test data of the measured machines do not overlap with training and validation data."""
     record = drifting(0.0)
-    way = halves(record)
-    assert sum(r.N for part in (way.train, way.validation, way.test) for r in part) == record.N
+    direction = halves(record)
+    assert (
+        sum(r.N for part in (direction.train, direction.validation, direction.test) for r in part) == record.N
+    )
     for machine in MACHINES.values():
         try:
-            ways = machine.ways()
+            directions = machine.directions()
         except (rf.InputError, OSError):
             continue
-        assert len({w.name for w in ways}) == len(ways)
-        for w in ways:
+        assert len({w.name for w in directions}) == len(directions)
+        for w in directions:
             seen = {(r.y.tobytes(), r.start) for r in (*w.train, *w.validation)}
             assert w.test and not seen & {(r.y.tobytes(), r.start) for r in w.test}
             ends = {r.source: r.start + r.N * r.Ts for r in (*w.train, *w.validation)}

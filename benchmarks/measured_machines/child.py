@@ -15,7 +15,7 @@ from typing import Any
 import rotflex_jax as rf
 from evaluation import errors, named, searched
 from public_machines.rounds import estimates
-from rotflex_jax.arena.measured import MACHINES, Way
+from rotflex_jax.arena.measured import MACHINES, Direction
 
 
 def main() -> None:
@@ -43,9 +43,9 @@ def row(
     Without `all_of_it`, only the effects that were found and the times of the search.
     """
     model = MACHINES[machine].model()
-    way = next(w for w in MACHINES[machine].ways() if w.name == direction)
+    chosen = next(d for d in MACHINES[machine].directions() if d.name == direction)
     clock, processor = time.perf_counter(), time.process_time()
-    result = searched(model, way.train, way.validation, way.test, say)
+    result = searched(model, chosen.train, chosen.validation, chosen.test, say)
     found: dict[str, Any] = {
         "clock_s": time.perf_counter() - clock,
         "processor_s": time.process_time() - processor,
@@ -53,35 +53,35 @@ def row(
     }
     if not all_of_it:
         return found
-    told = result.to_dict()
-    last = told["final_fit"] or {}
+    data = result.to_dict()
+    last = data["final_fit"] or {}
     say("simulating the test recordings")
     return found | {
-        "verdict": told["verdict"],
-        "sentence": told["sentence"],
-        "notes": told["notes"],
+        "verdict": data["verdict"],
+        "sentence": data["sentence"],
+        "notes": data["notes"],
         "laws": last.get("laws", []),
         "left_out": last.get("left_out", []),
         "friction_of_runs": last.get("friction_of_runs", {}),
         "estimates": estimates(result.final),
         # Errors that the search reports. `simulated` has errors on test data by the public interface.
         "reported": {
-            "baseline": reported(told["baseline"]),
-            "final": reported((told["rounds"] or [told["baseline"]])[-1]),
+            "baseline": reported(data["baseline"]),
+            "final": reported((data["rounds"] or [data["baseline"]])[-1]),
             # The final fit to training and validation recordings, if the search made one.
             "fitted to all": reported(last) if last else None,
         },
         "simulated": {
-            "baseline": errors(result.baseline.model, way.test),
-            "final": errors(result.final.model, way.test),
-            "fitted to all": errors(result.model_of, way.test) if result.final_fit else None,
+            "baseline": errors(result.baseline.model, chosen.test),
+            "final": errors(result.final.model, chosen.test),
+            "fitted to all": errors(result.model_of, chosen.test) if result.final_fit else None,
         },
-        "bands": [bands(result, r) for r in way.test],
-        "each_test": [errors(result.final.model, [r]) for r in way.test] if len(way.test) > 1 else None,
+        "bands": [bands(result, r) for r in chosen.test],
+        "each_test": [errors(result.final.model, [r]) for r in chosen.test] if len(chosen.test) > 1 else None,
         "seconds": {
-            part: sum(r.N * r.Ts for r in getattr(way, part)) for part in ("train", "validation", "test")
+            part: sum(r.N * r.Ts for r in getattr(chosen, part)) for part in ("train", "validation", "test")
         },
-        "others": compared(model, way, methods, say) if methods else None,
+        "others": compared(model, chosen, methods, say) if methods else None,
     }
 
 
@@ -98,11 +98,17 @@ def reported(stage: dict[str, Any]) -> dict[str, Any]:
     return {k: v for k, v in stage.items() if k.startswith(("held_out_rmse", "test_rmse"))}
 
 
-def compared(model: rf.Model, way: Way, methods: Sequence[str], say: Callable[[str], None]) -> dict[str, Any]:
+def compared(
+    model: rf.Model, direction: Direction, methods: Sequence[str], say: Callable[[str], None]
+) -> dict[str, Any]:
     """Other methods, fitted to training and validation recordings and evaluated on the test, best first."""
     began = time.perf_counter()
     table = rf.compare(
-        [*way.train, *way.validation], methods, mechanism=model, test=list(way.test), progress=say
+        [*direction.train, *direction.validation],
+        methods,
+        mechanism=model,
+        test=list(direction.test),
+        progress=say,
     ).to_dict()
     kept = ("method", "status", "reason", "held_out_rmse", "held_out_rmse_windows")
     rows = [{k: r.get(k) for k in kept} for r in table["rows"]]

@@ -1,4 +1,4 @@
-"""The measured machines: their models, and all ways to fit some recordings and evaluate on others."""
+"""The measured machines: their models, and all choices of recordings to fit and to evaluate on."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ SILVERBOX_SAMPLES = 16_000
 
 
 @dataclass(frozen=True)
-class Way:
+class Direction:
     """Which recordings are fitted, which decide, and on which the result is evaluated.
 
     Args:
@@ -40,7 +40,7 @@ class Machine:
     Args:
         dataset: name in the registry.
         preset: name of its mechanism in `rotflex_jax.joints`.
-        directions: function from the recordings of the data set to all directions.
+        make_directions: function from the recordings of the data set to all directions.
         options: options of the preset.
         unit: unit of the errors that are reported.
         factor: factor from the unit of the channel to this unit.
@@ -51,7 +51,7 @@ class Machine:
 
     dataset: str
     preset: str
-    directions: Callable[[list[rf.Recording]], list[Way]]
+    make_directions: Callable[[list[rf.Recording]], list[Direction]]
     options: Mapping[str, Any] = field(default_factory=dict)
     unit: str = "deg"
     factor: float = math.degrees(1.0)
@@ -64,74 +64,78 @@ class Machine:
         mechanism = getattr(rf.joints, self.preset)(**self.options).release(*self.released)
         return rf.Model(mechanism) if self.solver is None else rf.Model(mechanism, self.solver)
 
-    def ways(self) -> list[Way]:
+    def directions(self) -> list[Direction]:
         """All directions; this loads the recordings."""
-        return self.directions(rf.data.load_dataset(self.dataset))
+        return self.make_directions(rf.data.load_dataset(self.dataset))
 
 
-def learnt(name: str, runs: Sequence[rf.Recording], test: Sequence[rf.Recording]) -> Way:
+def learned(name: str, runs: Sequence[rf.Recording], test: Sequence[rf.Recording]) -> Direction:
     """Fit to the beginnings of runs, validation on their ends, and evaluation on other recordings."""
     parts = [r.split(SHARE) for r in runs]
-    return Way(name, tuple(a for a, _ in parts), tuple(b for _, b in parts), tuple(test))
+    return Direction(name, tuple(a for a, _ in parts), tuple(b for _, b in parts), tuple(test))
 
 
-def halves(run: rf.Recording) -> Way:
+def halves(run: rf.Recording) -> Direction:
     """Learn from the first half of a run and evaluate on the second half."""
     first, second = run.split(0.5)
-    return learnt("first half to second half", [first], [second])
+    return learned("first half to second half", [first], [second])
 
 
-def together(runs: Sequence[rf.Recording]) -> Way:
+def together(runs: Sequence[rf.Recording]) -> Direction:
     """Learn from the beginnings of all runs and evaluate on their ends."""
     parts = [r.split(SHARE) for r in runs]
-    return learnt(f"first {100 * SHARE:g} % of all to the rest", [a for a, _ in parts], [b for _, b in parts])
+    return learned(
+        f"first {100 * SHARE:g} % of all to the rest", [a for a, _ in parts], [b for _, b in parts]
+    )
 
 
-def crossed(runs: Mapping[str, rf.Recording]) -> list[Way]:
+def crossed(runs: Mapping[str, rf.Recording]) -> list[Direction]:
     """From each run to the others, then all runs together.
 
     With two runs, the end of the first is for validation and the other run is the test; or the first half of
     the other run is for validation and its second half is the test. With three runs, the next one is for
     validation and the third is the test.
     """
-    names, ways = list(runs), list[Way]()
+    names, directions = list(runs), list[Direction]()
     for k, name in enumerate(names):
         run, following = runs[name], names[(k + 1) % len(names)]
         if len(names) == 2:
             other = runs[following]
-            ways.append(learnt(f"{name} to {following}", [run], [other]))
+            directions.append(learned(f"{name} to {following}", [run], [other]))
             decides, tests = other.split(0.5)
-            ways.append(Way(f"{name} and half of {following} to the rest", (run,), (decides,), (tests,)))
+            directions.append(
+                Direction(f"{name} and half of {following} to the rest", (run,), (decides,), (tests,))
+            )
         else:
             last = {n: r for n, r in runs.items() if n not in (name, following)}
             title = f"{name}, decided on {following}, to {' and '.join(last)}"
-            ways.append(Way(title, (run,), (runs[following],), tuple(last.values())))
-    return [*ways, together(list(runs.values()))]
+            directions.append(Direction(title, (run,), (runs[following],), tuple(last.values())))
+    return [*directions, together(list(runs.values()))]
 
 
-def _emps(_: list[rf.Recording]) -> list[Way]:
+def _emps(_: list[rf.Recording]) -> list[Direction]:
     # The test record has force pulses, which the training record lacks. It is used for the errors only.
     official = rf.data.benchmark("emps")
     return [
-        learnt("official", [official.train], list(official.tests.values())),
+        learned("official", [official.train], list(official.tests.values())),
         halves(official.train),
     ]
 
 
-def _silverbox(_: list[rf.Recording]) -> list[Way]:
+def _silverbox(_: list[rf.Recording]) -> list[Direction]:
     official = rf.data.benchmark("silverbox")
     train = official.train.slice(0, SILVERBOX_SAMPLES)
-    return [learnt("official", [train], list(official.tests.values())), halves(train)]
+    return [learned("official", [train], list(official.tests.values())), halves(train)]
 
 
-def by_itself(name: str, run: rf.Recording) -> Way:
+def by_itself(name: str, run: rf.Recording) -> Direction:
     """Learn from the first half of a run, validate on the part after it, and evaluate on the end."""
     train, rest = run.split(0.5)
     decides, tests = rest.split(2 * SHARE - 1)
-    return Way(f"{name}, first half to its end", (train,), (decides,), (tests,))
+    return Direction(f"{name}, first half to its end", (train,), (decides,), (tests,))
 
 
-def _two_runs(runs: Sequence[rf.Recording]) -> list[Way]:
+def _two_runs(runs: Sequence[rf.Recording]) -> list[Direction]:
     """Two runs of the serial link, with LQR and with state feedback: each run alone, and across the runs.
 
     The runs are fifteen years apart, with different friction and amplifiers. A single run shows what a model
@@ -141,37 +145,37 @@ def _two_runs(runs: Sequence[rf.Recording]) -> list[Way]:
     return [*(by_itself(name, run) for name, run in named.items()), *crossed(named)]
 
 
-def _stage(stage: int, beside_the_other: bool) -> Callable[[list[rf.Recording]], list[Way]]:
+def _stage(stage: int, beside_the_other: bool) -> Callable[[list[rf.Recording]], list[Direction]]:
     """One stage of the serial link, with or without the acceleration of the other link as a signal."""
 
-    def ways(runs: list[rf.Recording]) -> list[Way]:
+    def directions(runs: list[rf.Recording]) -> list[Direction]:
         own = runs[stage - 1 :: 2]
         return _two_runs(own if beside_the_other else [r.with_signals({}) for r in own])
 
-    return ways
+    return directions
 
 
-def _both_stages(runs: list[rf.Recording]) -> list[Way]:
+def _both_stages(runs: list[rf.Recording]) -> list[Direction]:
     """Both stages of the serial link as one machine."""
     return _two_runs([stages_together(*runs[k : k + 2]) for k in (0, 2)])
 
 
-def _by_gain(runs: list[rf.Recording]) -> list[Way]:
+def _by_gain(runs: list[rf.Recording]) -> list[Direction]:
     """Servo with four gains and three motions for each: from the lower gains to the highest, and back."""
     low, high = runs[:9], runs[9:]
     return [
-        learnt("gains 100 to 400 to gain 800", low, high),
-        learnt("gain 800 to gains 100 to 400", high, low),
+        learned("gains 100 to 400 to gain 800", low, high),
+        learned("gain 800 to gains 100 to 400", high, low),
     ]
 
 
-def _elbow(runs: list[rf.Recording]) -> list[Way]:
+def _elbow(runs: list[rf.Recording]) -> list[Direction]:
     """One servo of the arm: from random motion to steps, and back."""
     own = {r.source.split(",")[0]: r for r in runs if ", Elbow" in r.source}
     random = [own["multisine"], own["prbs_excitation"]]
     return [
-        learnt("random motion to steps", random, [own["step_response"]]),
-        learnt("steps to random motion", [own["step_response"]], random),
+        learned("random motion to steps", random, [own["step_response"]]),
+        learned("steps to random motion", [own["step_response"]], random),
     ]
 
 

@@ -206,14 +206,19 @@ def measured(say: Callable[[str], None] = lambda _: None) -> list[Problem]:
     for name, machine in MACHINES.items():
         model = machine.model()
         try:
-            ways = machine.ways()
+            directions = machine.directions()
         except (rf.InputError, OSError) as problem:
             say(f"{name} is left out: {problem}")
             continue
-        for way in ways:
-            train, validation, test = way.train, way.validation, way.test
-            say(f"{name}, {way.name}")
-            truth = {"machine": name, "direction": way.name, "unit": machine.unit, "factor": machine.factor}
+        for direction in directions:
+            train, validation, test = direction.train, direction.validation, direction.test
+            say(f"{name}, {direction.name}")
+            truth = {
+                "machine": name,
+                "direction": direction.name,
+                "unit": machine.unit,
+                "factor": machine.factor,
+            }
             found.append(
                 Problem(MEASURED, train, validation, model, test, (), (), _noise(test, model), truth)
             )

@@ -100,7 +100,7 @@ def _slopes(
 
     def one(values: Any, x0: Any, K: Any, dvalues: Any, given: ProgramSamples) -> tuple[jax.Array, jax.Array]:
         parameters = RunParameters(values, parameter_set.gates, x0, K)
-        ways = TangentDirections(dvalues, directions.gates, x0_ways)
+        tangents = TangentDirections(dvalues, directions.gates, x0_ways)
 
         def place(sums: Any, y_hat: jax.Array, J: jax.Array, sample: Any) -> Any:
             (k, e, slopes), (y, seen) = sums, sample
@@ -111,7 +111,9 @@ def _slopes(
 
         none = jnp.zeros((len(x0_ways), *given.data.y.shape), given.data.y.dtype)
         run = RecordingSamples(*given.data, given.window, given.count)
-        return accumulate_outputs(structure, solver, parameters, ways, run, place, (0, none[0], none))[0][1:]
+        return accumulate_outputs(structure, solver, parameters, tangents, run, place, (0, none[0], none))[0][
+            1:
+        ]
 
     rows = (parameter_set.values, x0, parameter_set.K, jnp.swapaxes(directions.values, 0, 1), samples)
     if len(x0) == 1:

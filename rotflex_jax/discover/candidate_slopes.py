@@ -114,8 +114,8 @@ def _signal_slopes(
     responses: RunResponses,
 ) -> jax.Array:
     def one(values: Any, dvalues: Any, responses: Any, *samples: Any) -> jax.Array:
-        ways = (values, gates, dvalues, directions.gates)
-        return signal_sensitivities(structure, solver, *ways, RecordingSamples(*samples), responses)
+        tangents = (values, gates, dvalues, directions.gates)
+        return signal_sensitivities(structure, solver, *tangents, RecordingSamples(*samples), responses)
 
     data, window, _ = samples
     axes = (1, 1, *(0,) * 6)

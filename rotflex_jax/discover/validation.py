@@ -71,7 +71,7 @@ class ShortRuns:
         size, (R, P) = self.windows.first_states.shape[-1], run.values.shape
         x0_ways = np.eye(directions, run.x0.shape[-1])
         x0_ways[size:] = 0.0
-        ways = Directions(np.zeros((directions, R, P)), x0_ways, np.zeros((directions, len(run.gates))))
+        tangents = Directions(np.zeros((directions, R, P)), x0_ways, np.zeros((directions, len(run.gates))))
 
         def started_at(points: list[_FirstState]) -> ParameterSet:
             x0 = run.x0.copy()
@@ -85,7 +85,9 @@ class ShortRuns:
                 return [NormalEquations.of(slopes.reshape(size, -1).T, w.ravel()) for slopes, w in heads]
 
             # One run over each recording serves all of its windows.
-            return self.predictor.of_slopes(equations, [started_at(points)], [ways], self.windows.index)[0]
+            return self.predictor.of_slopes(equations, [started_at(points)], [tangents], self.windows.index)[
+                0
+            ]
 
         found = minimise_together(
             linearise,

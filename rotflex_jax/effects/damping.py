@@ -99,9 +99,9 @@ class ViscousAsymmetric(Force):
 
     def sentence(self) -> str:
         """The effect with its values, in one sentence."""
-        way = "forwards" if self.asymmetry >= 0 else "backwards"
+        side = "forwards" if self.asymmetry >= 0 else "backwards"
         return (
-            f"damping at the {self.at} is {2 * abs(self.asymmetry):.3g} N m s/rad stronger {way} than the "
+            f"damping at the {self.at} is {2 * abs(self.asymmetry):.3g} N m s/rad stronger {side} than the "
             "other way"
         )
 

@@ -437,14 +437,14 @@ class GreyBoxProblem:
         return dataclasses.replace(best, steps=sum(end.steps for end in ends))
 
     def _restarts(
-        self, start: FitPoint, ends: Sequence[FitAttempt], way: Sequence[FitStage]
+        self, start: FitPoint, ends: Sequence[FitAttempt], stages: Sequence[FitStage]
     ) -> list[FitAttempt]:
         """Ends of restarts: first from the start of the fit, then from random points around the best end.
 
         Args:
             start: Start of the fit.
             ends: Ends of the attempts so far.
-            way: Stages from the shortest horizon, if there are shorter ones, to the horizon of the fit.
+            stages: Stages from the shortest horizon, if there are shorter ones, to the horizon of the fit.
         """
         more, random = list[FitAttempt](), np.random.default_rng(0)
         for number in range(self.restarts):
@@ -452,13 +452,13 @@ class GreyBoxProblem:
             if self._settled(best, [*ends, *more]):
                 break
             self.say(f"fit: restart {number + 1} of at most {self.restarts}, cost so far {best.cost:.1f} nat")
-            if number == 0 and len(way) > 1:
-                more.append(self.attempt(self._at_windows(start, way[0].windows), way))
+            if number == 0 and len(stages) > 1:
+                more.append(self.attempt(self._at_windows(start, stages[0].windows), stages))
             elif number % 2:
-                more.append(self.attempt(self._moved_by_chance(best, NEAR, random), way[-1:]))
+                more.append(self.attempt(self._moved_by_chance(best, NEAR, random), stages[-1:]))
             else:
                 point = self._moved_by_chance(best, FAR, random)
-                more.append(self.attempt(self._at_windows(point, way[0].windows), way))
+                more.append(self.attempt(self._at_windows(point, stages[0].windows), stages))
         return more
 
     def _settled(self, best: FitAttempt, ends: Sequence[FitAttempt]) -> bool:

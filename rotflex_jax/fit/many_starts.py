@@ -167,13 +167,13 @@ def _minimise_each(
     def linearise(point: tuple[Array, Array]) -> JointEquations:
         z, x0 = point
         p, slopes = jax.jvp(values, (z,), (jnp.ones_like(z),))
-        ways = directions(structure, slopes, inputs.free, x0.shape[1])
+        tangents = directions(structure, slopes, inputs.free, x0.shape[1])
         gates = jnp.ones(len(structure.effects), p.dtype)
 
         def run(r: Any) -> NormalEquations:
             parameters = RunParameters(p, gates, whole_state(structure, r[0]), None)
             return normal_equations(
-                structure, solver, parameters, ways, RecordingSamples(*r[1]), inputs.scale
+                structure, solver, parameters, tangents, RecordingSamples(*r[1]), inputs.scale
             )
 
         return JointEquations(jax.lax.map(run, (x0, tuple(inputs.data))))

@@ -122,9 +122,9 @@ def _residuals(which: Any, step: Float[Array, " M"], fixed: Any) -> Float[Array,
 
 
 @_residuals.defjvp
-def _slopes(which: Any, at: Any, way: Any) -> tuple[Array, Array]:
+def _slopes(which: Any, at: Any, tangent: Any) -> tuple[Array, Array]:
     r, J = _compressed(which, *at)
-    return r, jnp.append(J @ way[0], 0.0)
+    return r, jnp.append(J @ tangent[0], 0.0)
 
 
 def _compressed(which: Any, step: Float[Array, " M"], fixed: Any) -> tuple[Array, Array]:

@@ -102,7 +102,7 @@ def normal_equations(
     structure: Mechanism,
     solver: Solver,
     parameters: RunParameters,
-    ways: TangentDirections,
+    tangents: TangentDirections,
     samples: RecordingSamples,
     scale: Float[Array, " C"],
 ) -> NormalEquations:
@@ -112,7 +112,7 @@ def normal_equations(
         structure: Mechanism without values; static.
         solver: Integration rule; static.
         parameters: Parameters, first states and gain; a free run if the gain is None.
-        ways: The D directions.
+        tangents: The D directions.
         samples: The recording.
         scale: Size of the error of each channel.
     """
@@ -129,9 +129,9 @@ def normal_equations(
             sums.H + sum(J[c][:, None] * J[c][None] for c in each),
         ), None
 
-    D, dtype = len(ways.x0), samples.u.dtype
+    D, dtype = len(tangents.x0), samples.u.dtype
     none = NormalEquations(jnp.zeros(len(scale), dtype), jnp.zeros(D, dtype), jnp.zeros((D, D), dtype))
-    return accumulate_outputs(structure, solver, parameters, ways, samples, fold, none)[0]
+    return accumulate_outputs(structure, solver, parameters, tangents, samples, fold, none)[0]
 
 
 def directions(
@@ -197,10 +197,10 @@ def runs_with_slopes(
     def one(row: Any) -> tuple[jax.Array, jax.Array]:
         values, slopes, x0, K, samples = row
         gates = jnp.ones(len(structure.effects), values.dtype)
-        ways = directions(structure, slopes, free, layout.states)
+        tangents = directions(structure, slopes, free, layout.states)
         parameters = RunParameters(values, gates, whole_state(structure, x0), K)
         return outputs_with_sensitivities(
-            structure, layout.solver, parameters, ways, RecordingSamples(*samples)
+            structure, layout.solver, parameters, tangents, RecordingSamples(*samples)
         )
 
     samples = tuple(data) if window is None else (*data, window)

@@ -249,7 +249,7 @@ class Walk:
         value, values = problem.at(found.point)
         return PointOfProfile(value, found.cost - problem.penalty(found.point), found.point, values)
 
-    def side(self, way: int, goal: float) -> list[PointOfProfile]:
+    def side(self, sign: int, goal: float) -> list[PointOfProfile]:
         """Points on one side, outwards until the root exceeds the goal or the quantity moves no further."""
         begin = self.along.walked(self.middle.value)
         step = goal / POINTS_TO_LEVEL * self.std if np.isfinite(self.std) else FIRST_STEP
@@ -258,12 +258,12 @@ class Walk:
         low, high = (self.along.walked(v) if np.isfinite(v) else v for v in self.along.limits)
         while len(found) < MOST_POINTS:
             at, root = self.along.walked(here.value), self.root(here)
-            target = at + way * step
+            target = at + sign * step
             if not self.along.positive:
                 # The coordinate approaches a limit but does not reach it.
                 target = float(np.clip(target, (at + 3 * low) / 4, (at + 3 * high) / 4))
             further = self.held(target, here.point)
-            moved = way * (self.along.walked(further.value) - at)
+            moved = sign * (self.along.walked(further.value) - at)
             if not np.isfinite(further.cost) or moved <= STUCK * abs(target - at):
                 break
             found.append(further)

@@ -137,10 +137,10 @@ def series_fit(
     e = rows.y - phi @ solution.w
     # Computed in the directions that the data determine, so that dependent columns do no harm.
     along = phi @ solution.basis
-    way = solution.basis * solution.shrink
+    weighted = solution.basis * solution.shrink
     parts = by_recording(along[:, None, :], e[:, None], rows.segments)
-    own = way @ sandwich(parts, curvature(parts, along.shape[1])) @ way.T
-    blind = np.linalg.norm(way * np.linalg.norm(along, axis=0), axis=1) == 0
+    own = weighted @ sandwich(parts, curvature(parts, along.shape[1])) @ weighted.T
+    blind = np.linalg.norm(weighted * np.linalg.norm(along, axis=0), axis=1) == 0
     own[blind, :] = own[:, blind] = np.nan
     covariance = np.full((P, P), np.nan)
     covariance[np.ix_(columns, columns)] = own

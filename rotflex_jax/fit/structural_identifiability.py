@@ -78,8 +78,8 @@ class Direction:
         if np.isinf(self.std):
             several = "one combination of them is" if len(names) == 2 else "combinations of them are"
             return f"{both} together: only {several} known"
-        ways = ", ".join(f"{n} {'up' if v[n] > 0 else 'down'}" for n in names)
-        return f"{both} together: hardly anything shows if they move at once ({ways}){wide}"
+        changes = ", ".join(f"{n} {'up' if v[n] > 0 else 'down'}" for n in names)
+        return f"{both} together: hardly anything shows if they move at once ({changes}){wide}"
 
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON types."""

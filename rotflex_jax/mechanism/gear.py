@@ -321,11 +321,11 @@ def crossing_time(
     distance: Float[Array, "*S"], b: Float[Array, "*S"], d: Float[Array, "*S"]
 ) -> Float[Array, "*S"]:
     """The root of `b t + d t^2 = distance` at which the motion crosses outwards."""
-    way = jnp.where(distance + 0.0 == 0, jnp.sign(b + d), jnp.sign(distance))
+    side = jnp.where(distance + 0.0 == 0, jnp.sign(b + d), jnp.sign(distance))
     square = b * b + 4 * d * distance
     positive = square > 0
-    root = way * jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1.0)), 0.0)
-    straight = way * b >= 0
+    root = side * jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1.0)), 0.0)
+    straight = side * b >= 0
     below = jnp.where(straight, b + root, 2 * d)
     above = jnp.where(straight, 2 * distance, root - b)
     return divided(above, below)

@@ -204,7 +204,7 @@ def run_responses(
     at_ports = _by_port(motion, to_torque, 1, len(ports)) if ports else None
     read = lambda x: read_outputs(mechanism, parameters.gates, x)  # noqa: E731
     units = jnp.broadcast_to(jnp.eye(n, dtype=X.dtype)[:, :, None], (n, n, len(X)))
-    H = jax.vmap(lambda way: jax.jvp(read, (X.T,), (way,))[1])(units)
+    H = jax.vmap(lambda tangent: jax.jvp(read, (X.T,), (tangent,))[1])(units)
     return RunResponses(
         LinearisedRun(X, A),
         true_outputs(structure, X.T).T,
@@ -296,7 +296,7 @@ def _responses(
         moved = [none] if laws_alone else [x, v, y, none]
         sizes = [a.size // S for a in moved]
         units = jnp.split(jnp.eye(sum(sizes), dtype=x.dtype), np.cumsum(sizes)[:-1], axis=1)
-        ways = [
+        tangents = [
             jnp.broadcast_to(unit.reshape(sum(sizes), *a.shape[:-1], 1), (sum(sizes), *a.shape))
             for unit, a in zip(units, moved, strict=True)
         ]
@@ -306,11 +306,11 @@ def _responses(
             end, motion = evaluated(at[0], at[1], at[2], rest, moved[-1])
             return end, jnp.stack(motion) if motion else jnp.zeros((0, 2, S), x.dtype)
 
-        def along(*way: Array) -> tuple[Array, Array]:
-            (_, motion), (end, _) = jax.jvp(f, tuple(moved), way)
+        def along(*tangent: Array) -> tuple[Array, Array]:
+            (_, motion), (end, _) = jax.jvp(f, tuple(moved), tangent)
             return motion, end
 
-        return jax.vmap(along, out_axes=(None, 0))(*ways)
+        return jax.vmap(along, out_axes=(None, 0))(*tangents)
 
     y, *rest = measured
     motion, responses = jax.lax.map(here, split_into_chunks((X, v, y, rest)))

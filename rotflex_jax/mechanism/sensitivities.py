@@ -143,7 +143,7 @@ def inactive_sensitivities(
         at = parameters.values, parameters.gates
         if not moves:
             return f(*at), None
-        return jax.vmap(lambda *way: jax.jvp(f, at, way), out_axes=(None, 0))(dvalues, dgates)
+        return jax.vmap(lambda *tangent: jax.jvp(f, at, tangent), out_axes=(None, 0))(dvalues, dgates)
 
     v, dv = with_derivatives(voltage, changes_voltage)
     c, dc = with_derivatives(prepare, enters_matrices)
