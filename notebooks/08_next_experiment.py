@@ -73,7 +73,7 @@ designed = rf.next_experiment(
     seconds=8.0,
     reference=ordinary.u,
     starts=1,
-    looks=12,
+    evaluations=12,
 )
 print(designed)
 

@@ -138,9 +138,9 @@ class Transform:
 
 def bound_reached(value: float, spec: Specification, std: float = math.nan) -> str:
     """The bound that a value has reached, in words: at the bound, or the interval includes the bound."""
-    for room, which in ((value - spec.lower, "lower"), (spec.upper - value, "upper")):
-        near = room < 1e-2 * spec.typical and (math.isnan(std) or room <= HALF_WIDTH_95 * std)
-        if math.isfinite(room) and (room < 1e-6 * spec.typical or near):
+    for distance, which in ((value - spec.lower, "lower"), (spec.upper - value, "upper")):
+        near = distance < 1e-2 * spec.typical and (math.isnan(std) or distance <= HALF_WIDTH_95 * std)
+        if math.isfinite(distance) and (distance < 1e-6 * spec.typical or near):
             return f"at its {which} bound"
     return ""
 

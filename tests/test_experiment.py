@@ -239,7 +239,7 @@ def experiment():
     limits = Limits(voltage=3.0, slew=400.0, travel=1.2, deflection=0.15)
     model = rf.joints.paper(joint_damping=0.003, hub_damping=0.004) + fx.Delay(time=0.003)
     sd = {"theta": 5.3e-4, "alpha": 5.3e-4}
-    settings = {"limits": limits, "seconds": 2.4, "Ts": 0.005, "noise": sd, "starts": 1, "looks": 15}
+    settings = {"limits": limits, "seconds": 2.4, "Ts": 0.005, "noise": sd, "starts": 1, "evaluations": 15}
     return rf.next_experiment(model, "delay@input", "lag@input", **settings)
 
 

@@ -414,7 +414,7 @@ BAD: dict[tuple[str, str], list[tuple[Any, str]]] = {
     ("next_experiment", "process_noise"): PROCESS_NOISE,
     ("next_experiment", "reference"): [([NAN] * 10, "is nan at sample 0"), (np.ones((2, 2)), "of shape")],
     ("next_experiment", "starts"): [(-1, "is -1"), (NAN, "is nan")],
-    ("next_experiment", "looks"): COUNTS,
+    ("next_experiment", "evaluations"): COUNTS,
     ("next_experiment", "progress"): NO_PROGRESS,
     ("experiment_until", "models"): [
         (None, "None was given"),

@@ -66,7 +66,7 @@ def next_experiment(
     reference: Float[np.ndarray, " N"] | None = None,
     improve: bool = True,
     starts: int = 2,
-    looks: int = MAX_EVALUATIONS,
+    evaluations: int = MAX_EVALUATIONS,
     progress: Progress | None = None,
 ) -> Experiment: ...
 
@@ -99,7 +99,7 @@ def next_experiment(
     reference: Float[np.ndarray, " N"] | None = None,
     improve: bool = True,
     starts: int = 2,
-    looks: int = MAX_EVALUATIONS,
+    evaluations: int = MAX_EVALUATIONS,
     probabilities: Any = None,
     progress: Progress | None = None,
 ) -> Experiment | Segment:
@@ -136,7 +136,7 @@ def next_experiment(
         reference: Voltage of the recording that does not distinguish the two effects [V]; noise if None.
         improve: Whether to optimise the best standard inputs, or only to rank them.
         starts: Number of standard inputs to optimise.
-        looks: Largest number of evaluations of each optimisation.
+        evaluations: Largest number of evaluations of each optimisation.
         probabilities: Prior probabilities of several models, by name or in their order.
         progress: Called with a line of text now and then.
 
@@ -170,7 +170,7 @@ def next_experiment(
     fitted = (model.model if isinstance(model, Fit) else Model.of(model)).without_gates()
     check_input_alone(fitted.mechanism, "a designed experiment")
     checked_limits(limits)
-    starts, looks = checks.whole(starts, "starts", 0), checks.whole(looks, "looks", 1)
+    starts, evaluations = checks.whole(starts, "starts", 0), checks.whole(evaluations, "evaluations", 1)
     reference = None if reference is None else checks.signal(reference, "reference")
     N, P = sample_counts(seconds, Ts)
     sd = noise_std([model], noise, fitted.mechanism.channels)
@@ -182,7 +182,7 @@ def next_experiment(
     designs = []
     for k, (rated, u, _) in enumerate(ranked[:starts] if improve else []):
         say(f"improving {rated.input}, {rated.setting} ({k + 1} of {starts})")
-        period = optimise_input(problem, u[:P], looks, say)
+        period = optimise_input(problem, u[:P], evaluations, say)
         whole = limits.playable(np.tile(period, max(1, round(N / P)) + 1)[:N], Ts)
         design = StandardInput("design", f"from {rated.input}, {rated.setting}", whole)
         designs.append(_rate_input(problem, design, thorough=True))

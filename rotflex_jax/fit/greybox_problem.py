@@ -311,7 +311,7 @@ class GreyBoxProblem:
             J,
             self.dataset.data.seen,
             LEAST_SCALE * self.dataset.noise,
-            self._room(point, stage.windows),
+            self._distances_to_bounds(point, stage.windows),
         )
 
     def errors(
@@ -487,8 +487,8 @@ class GreyBoxProblem:
 
     def held_by_ends(self, point: FitPoint, windows: Windows) -> Bool[np.ndarray, " M"]:
         """Which coordinates are at an end of their range."""
-        room = self._room(point, windows)
-        return (room[0] == 0) | (room[1] == 0)
+        distances = self._distances_to_bounds(point, windows)
+        return (distances[0] == 0) | (distances[1] == 0)
 
     def _follows(self, stage: FitStage) -> bool:
         """Whether first states, or some of them, are not fitted but follow from the parameters."""
@@ -533,15 +533,15 @@ class GreyBoxProblem:
             ]
         )
 
-    def _room(self, point: FitPoint, windows: Windows) -> tuple[np.ndarray, np.ndarray]:
+    def _distances_to_bounds(self, point: FitPoint, windows: Windows) -> tuple[np.ndarray, np.ndarray]:
         """How far each coordinate may move down (zero or negative) and up (zero or positive)."""
         c = self.coordinates(point, windows)
-        room = np.full((2, c.size), np.inf) * np.array([[-1], [1]])
-        for own, bound in zip(room, self.ranges, strict=True):
+        distances = np.full((2, c.size), np.inf) * np.array([[-1], [1]])
+        for own, bound in zip(distances, self.ranges, strict=True):
             own[: c.shared] = (bound - point.z)[list(point.free)]
             for r, z in enumerate(point.local_z):
                 own[c.local_columns(r)] = bound[list(point.local)] - z
-        return room[0], room[1]
+        return distances[0], distances[1]
 
     def _limit(self, point: FitPoint, windows: Windows) -> Float[np.ndarray, " M"]:
         """Largest step of each coordinate; a parameter with one bound may change by a factor of e."""

@@ -376,7 +376,7 @@ def likelihood_equations(
     J: Float[np.ndarray, "R N C D"],
     seen: Shaped[np.ndarray, "R N"],
     floor: Float[np.ndarray, " C"],
-    room: tuple[Float[np.ndarray, " M"], Float[np.ndarray, " M"]],
+    to_bounds: tuple[Float[np.ndarray, " M"], Float[np.ndarray, " M"]],
 ) -> LikelihoodEquations:
     """Likelihood and its quadratic model from errors and slopes.
 
@@ -386,7 +386,7 @@ def likelihood_equations(
         J: Slopes of the errors along the directions of each window.
         seen: Not zero where a sample counts.
         floor: Least scale of each channel.
-        room: How far each coordinate may move down and up.
+        to_bounds: How far each coordinate may move down and up.
     """
     cost, scale = negative_log_likelihood(e, int(np.count_nonzero(seen)), floor)
     with np.errstate(over="ignore", invalid="ignore"):
@@ -397,4 +397,4 @@ def likelihood_equations(
     inner = np.arange(coordinates.size) >= coordinates.shared
     for r in range(len(e)):
         inner[coordinates.local_columns(r)] = False
-    return LikelihoodEquations(cost, scale, g, H, inner, *room, parts)
+    return LikelihoodEquations(cost, scale, g, H, inner, *to_bounds, parts)

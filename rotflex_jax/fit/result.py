@@ -113,8 +113,8 @@ class Fit:
         for e in self.parameters:
             spec, half = specs[e.name], HALF_WIDTH_95 * e.std
             bounds = [b for b in (spec.lower, spec.upper) if math.isfinite(b)]
-            room = min((abs(e.value - b) for b in bounds), default=math.inf)
-            if e.free and not half <= WIDE_INTERVAL * room:
+            to_bound = min((abs(e.value - b) for b in bounds), default=math.inf)
+            if e.free and not half <= WIDE_INTERVAL * to_bound:
                 found.append(e.name)
         return tuple(found)
 
