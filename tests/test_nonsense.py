@@ -87,7 +87,7 @@ FUNCTIONS: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
         },
     ),
     "CallbackRig": (rf.CallbackRig, {"function": np.sin, "limits": LIMITS, "Ts": 0.002}),
-    "fleet": (rf.fleet, {"joint": JOINT, "recordings": [RUN], "folder": "never-made", "workers": 0}),
+    "fleet": (rf.fleet, {"mechanism": JOINT, "recordings": [RUN], "folder": "never-made", "workers": 0}),
     "arena.score": (rf.arena.score, {"methods": "search"}),
     "load": (rf.load, {"source": "no-such.csv"}),
     "load, from a frame": (rf.load, {"source": FRAME, "outputs": ["theta", "alpha"]}),
@@ -436,7 +436,7 @@ BAD: dict[tuple[str, str], list[tuple[Any, str]]] = {
     ("CallbackRig", "function"): [(3, "is 3")],
     ("CallbackRig", "limits"): [(5.0, "is 5.0")],
     ("CallbackRig", "Ts"): [(NAN, "is nan"), (0, "is 0")],
-    ("fleet", "joint"): NO_MODEL,
+    ("fleet", "mechanism"): NO_MODEL,
     ("fleet", "recordings"): [
         (None, "None was given"),
         (3, "3 was given"),

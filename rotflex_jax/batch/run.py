@@ -26,7 +26,7 @@ from rotflex_jax.recording import Recording
 
 
 def fleet(
-    joint: Mechanism | Model,
+    mechanism: Mechanism | Model,
     recordings: Iterable[str | os.PathLike[str] | Recording],
     *,
     folder: str | os.PathLike[str],
@@ -51,7 +51,7 @@ def fleet(
     starts processes.
 
     Args:
-        joint: The model from which each search starts.
+        mechanism: The model from which each search starts.
         recordings: Files or recordings, of any lengths.
         folder: Folder for `summary.html`, `summary.csv`, `recordings/NAME.json`, and `models/NAME.json`,
             which `Model.load` reads.
@@ -74,7 +74,7 @@ def fleet(
         InputError: There is no recording, a recording is given twice, the share is not between 0 and 1, an
             argument is unknown, the folder cannot be written, or the scheduler does not answer.
     """
-    model, progress = Model.of(joint), checks.progress(progress)
+    model, progress = Model.of(mechanism), checks.progress(progress)
     sources = _sources(recordings)
     if not callable(search):
         raise InputError(
