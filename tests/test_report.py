@@ -904,7 +904,9 @@ def test_recordings_of_one_window_say_that_both_errors_are_the_same(discovery) -
 
 def test_the_share_that_is_a_candidates_own_is_a_plain_number(discovery, undrawn) -> None:
     shares = (0.997, 0.00041)
-    first = [dataclasses.replace(r, unconfounded=x) for r, x in zip(discovery.ranking, shares, strict=False)]
+    first = [
+        dataclasses.replace(r, orthogonal_fraction=x) for r, x in zip(discovery.ranking, shares, strict=False)
+    ]
     page = render(dataclasses.replace(discovery, ranking=(*first, *discovery.ranking[2:])))
     assert re.search(r">\s*100 %\s*<", page) and re.search(r">\s*0.041 %\s*<", page) and "e+02" not in page
 

@@ -263,7 +263,7 @@ def searched(split: Split, say: Callable[[str], None]) -> dict[str, Any]:
                 "port": r.port,
                 "nats": r.score,
                 "excited": r.excited,
-                "unconfounded": r.unconfounded,
+                "unconfounded": r.orthogonal_fraction,
             }
             for r in found.ranking
         ],
@@ -289,6 +289,6 @@ def direction(split: Split, say: Callable[[str], None]) -> dict[str, Any]:
         "alone": row["status"],
         "verdict": str(found.verdict.value),
         "excited": ranked.excited,
-        "unconfounded": ranked.unconfounded,
-        "detectable": ranked.smallest,
+        "unconfounded": ranked.orthogonal_fraction,
+        "detectable": ranked.detection_limit,
     }

@@ -433,8 +433,8 @@ class Ranked:
         port: Where it would act.
         score: Penalised score [nat]; negative where the data are evidence against it.
         excited: False where this recording could not have shown an effect of a plausible size.
-        unconfounded: Share of its trace in the outputs that the baseline cannot imitate, 0 to 1.
-        smallest: Detection limit: factor of a plausible size that would just have been visible.
+        orthogonal_fraction: Share of its trace in the outputs that the baseline cannot imitate, 0 to 1.
+        detection_limit: Detection limit: factor of a plausible size that would just have been visible.
         score_free_run: Penalised score in free runs over some seconds [nat]; None where it was not computed.
     """
 
@@ -442,8 +442,8 @@ class Ranked:
     port: str
     score: float
     excited: bool
-    unconfounded: float
-    smallest: float
+    orthogonal_fraction: float
+    detection_limit: float
     score_free_run: float | None = None
 
     def to_dict(self) -> dict[str, Any]:
@@ -454,7 +454,7 @@ class Ranked:
             "score": json_number(self.score),
             "score_free_run": None if self.score_free_run is None else json_number(self.score_free_run),
             "excited": self.excited,
-            "unconfounded": json_number(self.unconfounded),
+            "unconfounded": json_number(self.orthogonal_fraction),
         }
 
 

@@ -226,7 +226,7 @@ def _ranked(r: Ranked, outcome: Outcome) -> dict[str, str]:
         "label": effect_label(r.effect, r.port),
         "title": effect_title(r.effect),
         "score": plain_number(r.score),
-        "own": percent_own(r.unconfounded),
+        "own": percent_own(r.orthogonal_fraction),
         "state": outcome.value,
     }
 
