@@ -466,6 +466,13 @@ def test_the_machine_has_borne_the_most_of_any_recording() -> None:
     assert seen_limits(alone, rf.Model(single)).deflection == np.inf
 
 
+def test_a_fall_of_the_voltage_is_a_change_too() -> None:
+    """A sawtooth that rises over 50 samples and falls within one has the slew rate of its fall."""
+    u = np.tile(np.linspace(0.0, 1.0, 51), 4)
+    recording = Recording(u=u, y=np.column_stack([u, 0.1 * u]), Ts=0.01)
+    assert seen_limits((recording,), rf.Model(rf.joints.paper())).slew == pytest.approx(100.0)
+
+
 def test_the_deflection_is_that_of_the_model_in_any_order_of_the_columns() -> None:
     k = np.arange(60)
     theta, alpha, current = np.sin(k / 9), 0.1 * np.sin(k / 9), 5 * np.cos(k / 5)

@@ -15,6 +15,7 @@ import small_problem as sp
 import rotflex_jax as rf
 import rotflex_jax.effects as fx
 from rotflex_jax.arena.simulator.records import make_record
+from rotflex_jax.discover import friction_of_runs
 from rotflex_jax.discover.checkpoint import kept, restored
 from rotflex_jax.discover.explanation import Explanation
 from rotflex_jax.discover.friction_of_runs import Refits, own_friction_notes, refit_with_own_friction
@@ -299,3 +300,41 @@ def test_friction_of_the_users_model_may_differ_between_runs_too():
 def test_friction_of_runs_needs_a_law_of_friction(supermodel):
     h = with_effect(supermodel, sp.unfitted(supermodel), CandidateStart(COULOMB, np.array([0.02])), 1.0)
     assert with_own_friction(supermodel, h, EffectLocation("voltage_offset", "input")) is h
+
+
+@pytest.mark.parametrize(
+    ("gains", "scatter", "asked", "better"),
+    [
+        ((0.2, 0.2), 0.2, (0, 1), True),
+        ((0.09, 0.09), 0.02, (0, 1), False),
+        ((0.2, 0.2), 0.757, (0, 1), False),
+        ((0.5, 0.02), 0.2, (0, 1), False),
+        ((0.5, 0.02), 0.2, (0,), True),
+    ],
+    ids=["clearly", "by little", "with scatter", "not in the second", "second not asked"],
+)
+def test_own_friction_must_be_clearly_better_in_each_run(
+    gains: tuple[float, float], scatter: float, asked: tuple[int, ...], better: bool
+):
+    """By a tenth of a nat a block and 2.5 standard deviations in all, and 1.5 of them in each run.
+
+    The sum of 40 blocks has the standard deviation `scatter sqrt(40)`: with 0.757 it is 1.65 standard
+    deviations in each run and 2.35 in both.
+    """
+    varied = np.where(np.arange(40) % 2, scatter, -scatter)
+    a = np.concatenate([gain + varied for gain in gains])
+    assert friction_of_runs._better_in_each(a, np.zeros(80), (40, 40), asked) is better
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "much"), [(0.0351, 0.0114, True), (0.0349, 0.0114, False), (0.0351, 0.0115, False)]
+)
+def test_a_large_difference_of_friction_is_one_in_each_run(first: float, second: float, much: bool):
+    """Friction of a validation run is more than 1.75 times that of training, or the other way round."""
+    fitted = np.array([[1.0, 0.02, 0.001], [1.0, -first, 0.001], [1.0, 0.001, second]])
+    found: Any = SimpleNamespace(
+        hypothesis=SimpleNamespace(sizes=(1, 2), mean_values=lambda s: np.array([1.0, 0.02, 0.001])),
+        adapted=SimpleNamespace(values=lambda s: fitted),
+    )
+    supermodel: Any = None
+    assert friction_of_runs._differs_much(supermodel, found, [1, 2]) is much

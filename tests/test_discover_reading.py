@@ -3,6 +3,7 @@
 import dataclasses
 import re
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -10,9 +11,16 @@ import pytest
 
 import rotflex_jax as rf
 from rotflex_jax.arena.simulator.records import make_record
-from rotflex_jax.discover import forward_selection
-from rotflex_jax.discover.reading import held_equivalent, sign_note
+from rotflex_jax.discover import forward_selection, reading
+from rotflex_jax.discover.reading import (
+    held_equivalent,
+    nats_if_smooth,
+    opposite_signs,
+    sign_note,
+    still_channels,
+)
 from rotflex_jax.effects import Coulomb, LuGre, Stribeck
+from rotflex_jax.fit.dataset import Dataset, StackedRecordings
 
 FAST, SLOW, SECONDS = 1000, 100, 12.0
 FRICTIONS = [(Coulomb, "hub"), (Stribeck, "hub"), (LuGre, "hub")]
@@ -59,6 +67,62 @@ def test_a_held_input_is_not_offered_another_reading() -> None:
     demo = rf.data.demo_recording().slice(0, 1500)
     found = rf.discover(rf.joints.paper(), *demo.split(0.7), candidates=FRICTIONS, rounds=0)
     assert not any("--intersample" in note or "hardly moves" in note for note in found.notes)
+
+
+@pytest.mark.parametrize(
+    ("repeated", "gain", "scatter", "offered"),
+    [(0.4, 25.0, 0.5, True), (0.6, 25.0, 0.5, False), (0.4, 15.0, 0.3, False), (0.4, 25.0, 2.0, False)],
+    ids=["varies", "held", "small gain", "scattered gain"],
+)
+def test_a_smooth_input_must_gain_clearly_and_vary(
+    repeated: float, gain: float, scatter: float, offered: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """More than 20 nats and 3 standard deviations, and at most half of the samples repeat the one before."""
+    rng = np.random.default_rng(1)
+    steps = np.where(np.arange(200) % 10 < 10 * repeated, 0.0, rng.uniform(0.1, 0.2, 200))
+    u = np.cumsum(steps * rng.choice([-1.0, 1.0], 200))
+    run = rf.Recording(u=u, y=np.column_stack([u, u]), Ts=0.01, accept=("units",))
+    stacked = StackedRecordings(u[None], run.y[None], np.ones((1, 200)), np.array([0.01]))
+    data = Dataset((run,), stacked, np.ones(2), 1.0, np.zeros((1, 4)), np.zeros((1, 0)))
+    smooth = SimpleNamespace(with_likelihood=lambda h: h)
+    problem: Any = SimpleNamespace(
+        dataset=data, predictor=SimpleNamespace(solver=rf.Exponential()), of_dataset=lambda given: smooth
+    )
+    varied = np.where(np.arange(100) % 2, scatter, -scatter)  # of zero sum
+    fitted: Any = SimpleNamespace(log_likelihood=0.0, blocks=np.zeros(100))
+    refitted = SimpleNamespace(blocks=gain / 100 + varied)
+    monkeypatch.setattr(reading, "refit", lambda problem, starts, alternations: [refitted])
+    assert nats_if_smooth(problem, fitted) == pytest.approx(gain if offered else 0.0)
+
+
+@pytest.mark.parametrize(
+    ("left", "other", "likelier", "named"),
+    [(0.8, 0.47, 1.0, True), (0.8, 0.49, 1.0, False), (0.49, 0.1, 1.0, False), (0.8, 0.1, -1.0, False)],
+    ids=["much better", "hardly better", "small error", "less likely"],
+)
+def test_the_limits_of_an_opposite_sign(
+    left: float, other: float, likelier: float, named: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Errors of at least half of the motion fall below 0.6 of their size, and the data become likelier."""
+    errors = lambda h: np.array([0.0, h.error])  # noqa: E731
+    problem: Any = SimpleNamespace(channel_errors=errors)
+    monkeypatch.setattr(reading, "_deviations", lambda problem: np.ones(2))
+    monkeypatch.setattr(reading, "_with_opposite_sign", lambda *given: problem)
+    monkeypatch.setattr(reading, "values_given", lambda problem: None)
+    monkeypatch.setattr(reading, "as_free_run", lambda *given: SimpleNamespace(log_likelihood=0.0))
+    end = SimpleNamespace(error=other, log_likelihood=likelier)
+    monkeypatch.setattr(reading, "refit", lambda *given: [end])
+    fitted: Any = SimpleNamespace(error=left, log_likelihood=0.0)
+    found = opposite_signs(rf.Model(rf.joints.paper()), problem, fitted, 2.0)
+    assert found == ({"alpha": (left, other)} if named else {})
+
+
+def test_a_tenth_of_the_motion_is_hardly_any(monkeypatch: pytest.MonkeyPatch) -> None:
+    mechanism = rf.joints.paper()
+    train: Any = SimpleNamespace(supermodel=SimpleNamespace(mechanism=mechanism), sizes=np.array([2.0, 0.5]))
+    validation: Any = SimpleNamespace(sizes=np.array([0.19, 0.055]))
+    monkeypatch.setattr(reading, "_deviations", lambda problem: problem.sizes)
+    assert still_channels(train, validation) == {"theta": (2.0, 0.19)}
 
 
 def signs(train: rf.Recording, validation: rf.Recording, model: rf.Mechanism) -> tuple[list[str], list[str]]:
