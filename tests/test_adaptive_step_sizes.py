@@ -223,12 +223,15 @@ def test_settling_time_measured_on_a_series_of_the_class_is_the_one_asked_for() 
     assert settling_samples(WHITE, mu, w, int(np.flatnonzero(products)[0])) == pytest.approx(7000, rel=0.001)
 
 
-def test_settling_agrees_with_stepping_the_mean() -> None:
+@pytest.mark.parametrize("known", [0, 2])
+def test_settling_agrees_with_stepping_the_mean(known: int) -> None:
+    """Also where the first weights are known and have no step."""
     R1 = ar1_covariance(0.5, 2)
     moments = Moments.gaussian(R1)
     rng = np.random.default_rng(5)
     w, start = rng.standard_normal(6), rng.standard_normal(6)
     mu = np.array([0.05, 0.05, 0.05, 0.02, 0.01, 0.02])
+    start[:known], mu[:known] = w[:known], 0.0
     d, outside = start - w, np.zeros(6)
     for k in range(5000):
         outside = np.where(np.abs(d) > 0.05 * np.abs(w), k + 1, outside)
@@ -243,8 +246,32 @@ def test_a_weight_whose_best_value_is_out_of_reach_never_settles() -> None:
     moments, mu = Moments.of_regressors(np.column_stack([x, x])), 0.01
     assert settling_samples(moments, mu, np.array([1.0, 0.8]), 0) == np.inf  # ends 10 % below
     # With equal weights the error falls by 1 - 2 mu mean x^2 with each sample.
-    steps = np.log(0.05) / np.log(1 - 2 * mu * np.mean(x**2))
-    assert settling_samples(moments, mu, np.ones(2), 0) == np.ceil(steps)
+    falls = 1 - 2 * mu * np.mean(x**2)
+    assert settling_samples(moments, mu, np.ones(2), 0) == np.ceil(np.log(0.05) / np.log(falls))
+    # It ends 4 % below 1 here, so that 1 % is left for what decays from 0.96.
+    steps = np.ceil(np.log(0.01 / 0.96) / np.log(falls))
+    assert settling_samples(moments, mu, np.array([1.0, 0.92]), 0) == steps
+
+
+def test_a_difference_of_weights_that_no_signal_shows_stays() -> None:
+    x = np.random.default_rng(7).standard_normal(500)
+    moments, mu, w = Moments.of_regressors(np.column_stack([x, x])), 0.01, np.array([1.0, 0.5])
+    start = np.array([2.0, -1.0])
+    found = learning_curve(moments, mu, w, np.array([0.0, 50.0, 5000.0]), start=start).weights
+    R = np.full((2, 2), np.mean(x**2))
+    expected = [w + np.linalg.matrix_power(np.eye(2) - mu * R, t) @ (start - w) for t in (0, 50, 5000)]
+    np.testing.assert_allclose(found, expected, atol=1e-9)
+    np.testing.assert_allclose(found[2], [2.25, -0.75], atol=1e-9)  # sum of the best, difference of the first
+
+
+def test_time_of_a_weight_and_bound_of_the_mean_are_those_of_the_mean_recursion() -> None:
+    """The mean errors are (I - D R)^t d, whose sum over t is (D R)^-1 d, with D the step sizes."""
+    moments = Moments.gaussian(ar1_covariance(0.7, 2))
+    mu = np.array([0.03, 0.02, 0.05, 0.004, 0.01, 0.002])
+    found, DR = analyse(moments, mu), np.diag(mu) @ moments.R
+    np.testing.assert_allclose(found.coefficient_times, np.diag(np.linalg.inv(DR)), rtol=1e-8)
+    assert found.mean_factor == pytest.approx(2 / np.max(np.linalg.eigvals(DR).real), rel=1e-9)
+    np.testing.assert_allclose(found.time_constants, np.sort(1 / np.linalg.eigvals(DR).real), rtol=1e-8)
 
 
 def test_settling_factor_puts_a_weight_where_it_was_asked_for() -> None:
