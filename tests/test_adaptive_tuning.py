@@ -170,6 +170,14 @@ def test_a_start_that_diverges_is_led_back(short: list[Recording]) -> None:
         assert np.all(np.diff(path.values) < 0)
 
 
+def test_of_several_starts_the_best_end_counts(short: list[Recording]) -> None:
+    """After one run from each start the ends are the starts, and almost no step learns almost nothing."""
+    starts = [{"mu1": 1e-5, "mu2": 1e-6}, {"mu1": 0.02, "mu2": 0.002}]
+    found = tune(two_steps, starts, BASIS, short, "alpha", objective="final", evaluations=1)
+    assert found.settings == pytest.approx(starts[1]) and found.evaluations == 2
+    assert found.paths[0].values[-1] > found.paths[1].values[-1] == found.value
+
+
 def test_divergence_from_every_start_is_told(short: list[Recording]) -> None:
     with pytest.raises(InputError, match="diverges from every one of 1 starts"):
         tune(two_steps, {"mu1": 5.0, "mu2": 5.0}, BASIS, short, "alpha", objective="final", evaluations=5)
@@ -187,6 +195,12 @@ def test_a_margin_is_kept(short: list[Recording]) -> None:
     assert kept.stability.factor > 0.6 * least
     assert kept.stability.factor > 1.5 * free.stability.factor
     assert kept.value > free.value
+    # The value is the objective without the penalty.
+    by_degree = dict(enumerate(kept.settings[name] for name in ("mu1", "mu1", "mu2")))
+    phi, y = ([x(r)[10:] for r in short] for x in (lambda r: BASIS.regressors(r.u), lambda r: r.y[:, 0]))
+    runs = [lms_by_hand(x, t, BASIS.step_sizes(by_degree))[1] for x, t in zip(phi, y, strict=True)]
+    least = np.linalg.lstsq(np.concatenate(phi), np.concatenate(y), rcond=None)[1][0]
+    assert kept.value == pytest.approx(np.sum(np.square(runs)) / least, rel=1e-6)
 
 
 @pytest.mark.parametrize("a", [0.0, 0.8])
