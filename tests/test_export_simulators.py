@@ -38,7 +38,7 @@ from rotflex_jax.effects import (
 )
 from rotflex_jax.errors import InputError
 from rotflex_jax.export import to_bam, to_fmu, to_mjcf, to_urdf
-from rotflex_jax.export.certificate import standard_input
+from rotflex_jax.export.certificate import Subject, standard_input
 from rotflex_jax.export.fmu import platform_folder
 from rotflex_jax.export.mjcf import run_in_mujoco
 from rotflex_jax.joints import emps, paper, position_servo, single_inertia, xl330_pendulum
@@ -134,6 +134,19 @@ def test_a_difference_shows_in_the_certificate():
         assert np.abs(run_in_mujoco(text.replace(old, new), U, Ts) - own).max() > NOISE
 
 
+def test_a_certificate_has_the_size_of_each_difference_and_of_the_motion():
+    """The outputs of the other program are those of the toolkit, moved by known amounts."""
+    u = -np.ones(200)  # a motion to one side of zero
+    subject, own = Subject.of(JOINT, Ts, u), simulate(JOINT, u, Ts)
+    k = np.arange(200)
+    apart = np.column_stack([np.where(k == 7, -math.radians(3.0), 0.0), np.full(200, 1e-3)])
+    found = subject.certificate("X", "Y", own + apart)
+    assert found.largest == pytest.approx((math.radians(3.0), 1e-3), rel=1e-9)
+    assert found.rms == pytest.approx((math.radians(3.0) / math.sqrt(200), 1e-3), rel=1e-9)
+    assert found.spans == pytest.approx(tuple(own.max(axis=0) - own.min(axis=0)))
+    assert "theta: largest difference 0.0524 rad = 3 deg, rms" in str(found)
+
+
 @pytest.mark.parametrize(
     ("effect", "said", "at_least"),
     [
@@ -159,10 +172,12 @@ def test_what_mujoco_cannot_say_is_named(effect, said, at_least):
     assert max(certificate.largest) >= at_least
 
 
-def test_order_on_the_voltage_counts():
-    """A limit after a lag is left out of the file; a limit before the lag is exported."""
-    assert "saturation" in certified(JOINT + Lag() + Saturation(limit=1.0)).certificate.left_out[0]
-    assert certified(JOINT + Saturation(limit=1.0) + Lag()).certificate.left_out == ()
+@pytest.mark.parametrize("other", [Lag(), VoltageOffset(offset=0.2)], ids=["lag", "offset"])
+def test_order_on_the_voltage_counts(other):
+    """A limit after a lag or an offset is left out of the file; a limit before them is exported."""
+    assert "saturation" in certified(JOINT + other + Saturation(limit=1.0), U[:500]).certificate.left_out[0]
+    before = certified(JOINT + Saturation(limit=1.0) + other, U[:500]).certificate
+    assert before.left_out == () and before.largest[0] < NOISE
 
 
 def test_names_of_others_stay_names():
@@ -270,8 +285,9 @@ def test_bam_takes_the_friction_of_a_gear_as_that_of_its_load():
         ((Coulomb("hub", level=0.03), Viscous("hub", coefficient=0.005)), "m1", set()),
         ((Stribeck("hub"),), "m2", {"friction_stribeck", "dtheta_stribeck", "alpha"}),
         ((LoadFriction("hub", driving=0.15, tied=True),), "m3", {"load_friction_base"}),
+        ((Coulomb("hub", level=0.03), Delay(time=0.023)), "m1", {"command_delay"}),
     ],
-    ids=["m1", "m2", "m3"],
+    ids=["m1", "m2", "m3", "delay"],
 )
 def test_bam_does_what_the_toolkit_does(effects, model, keys):
     servo = SERVO.with_values({"hub.gravity.cosine": 0.02})
