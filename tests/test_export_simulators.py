@@ -117,6 +117,20 @@ def test_mujoco_has_the_servo_with_its_limit_and_its_weight():
     assert "derivative of 0.03 s/rad" in "\n".join(to_bam(servo, u=U[:50]).certificate.left_out)
 
 
+def test_mujoco_has_the_motor_with_its_torque_and_its_time_constant():
+    """Torque per volt and per speed at constant current, and inductance over resistance, are the motor's."""
+    machine = paper(inductance=2e-3, back_emf=0.006, efficiency=0.8)
+    (motor,) = ET.fromstring(certified(machine, U[:100]).content).iter("dcmotor")
+    constant, resistance, inductance = (
+        float(motor.get(k)) for k in ("motorconst", "resistance", "inductance")
+    )
+    of = {name.rpartition(".")[2]: v for name, v in machine.named_values.items() if "hub.motor" in name}
+    torque = of["efficiency"] * of["torque_constant"] * of["gear_ratio"] / of["resistance"]
+    assert constant / resistance == pytest.approx(torque)
+    assert constant**2 / resistance == pytest.approx(torque * of["back_emf"] * of["gear_ratio"])
+    assert inductance / resistance == pytest.approx(2e-3 / of["resistance"])
+
+
 def test_mujoco_has_an_axis_that_slides():
     certificate = certified(emps() + Coulomb("axis", level=20.0)).certificate
     assert certificate.units == ("m",) and certificate.largest[0] < 2e-3 * certificate.spans[0]
