@@ -274,6 +274,34 @@ def test_probes_are_valid_and_show(cls, scale):
         assert np.linalg.matrix_rank(np.array(moved), tol=1e-12) == len(group)
 
 
+@pytest.mark.parametrize("name", ["backlash", "elastic_backlash"])
+def test_gaps_that_are_tried_take_the_motor_3_to_34_ms(name):
+    """From rest, a torque T on an inertia J crosses a play of two gaps in t: 2 gap = T / J t^2 / 2."""
+    gaps = np.sort([group[0]["gap"] for group in CATALOG[name].probes(SCALES[0])])
+    times = np.sqrt(4 * gaps * SCALES[0].inertia / SCALES[0].torque)
+    assert times[[0, -1]] == pytest.approx([3e-3, 34e-3], rel=0.01)
+    np.testing.assert_allclose(gaps[1:] / gaps[:-1], 2.0)
+
+
+@pytest.mark.parametrize(
+    ("position", "counts"), [(0.3, [6, 7, 8, 9, 10, 12, 14, 16, 18, 20, 24]), (0.07, [24]), (0.01, [24])]
+)
+def test_periods_that_are_tried_show_about_half_a_period(position, counts):
+    """A motion of +-0.3 rad covers half a period (pi rad of phase) from 5.2 periods per turn."""
+    groups = Cogging.probes(dataclasses.replace(SCALES[0], position=position))
+    assert [group[0]["periods"] for group in groups] == counts
+    assert {probe["sine"] + probe["cosine"] for group in groups for probe in group} == {
+        0.1 * SCALES[0].torque
+    }
+
+
+def test_the_inertia_that_is_tried_takes_a_tenth_of_the_torque():
+    """A sine of amplitude A has the speed A w and the acceleration A w^2."""
+    A, w = 0.4, 7.0
+    ((probe,),) = Inertia.probes(dataclasses.replace(SCALES[0], position=A, speed=A * w))
+    assert probe["inertia"] * A * w**2 == pytest.approx(0.1 * SCALES[0].torque)
+
+
 @every_effect
 def test_ports_and_relations(cls):
     assert set(cls.searched) <= {*cls.ports, "loaded"}  # a role of the hub

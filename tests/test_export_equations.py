@@ -174,3 +174,4 @@ def test_matrices_and_numbers_are_in_text_and_latex():
 def test_what_is_switched_off_is_not_written():
     model = Model(paper() + Coulomb("hub"), gates=(*[1.0] * 6, 0.0))
     assert "Coulomb" not in text(model) and "Coulomb" not in latex(model)
+    assert state_space(model).dropped == ()
