@@ -91,6 +91,15 @@ def test_a_linear_system_takes_one_initial_sample_and_a_recording_in_a_list() ->
         system.simulate(cast(Any, None))
 
 
+def test_a_linear_system_has_a_constant_of_state_and_output() -> None:
+    """x+ = 0.8 x + 0.5 u + 0.1 and y = 2 x + 0.3 from x = 3 at rest of the input, in closed form."""
+    A, B, C, D = (np.array(x) for x in ([[0.8]], [[0.5, 0.1]], [[2.0]], [[0.0, 0.3]]))
+    system = LinearSystem(A=A, B=B, C=C, D=D, K=np.zeros((1, 1)), Ts=Ts)
+    y = 2 * (0.5 + 2.5 * 0.8 ** np.arange(60.0)) + 0.3
+    record = Recording(u=np.zeros(60), y=y[:, None], Ts=Ts, n_init=10, accept=("units", "constant_input"))
+    np.testing.assert_allclose(system.simulate(record)[:, 0], y, rtol=1e-9)
+
+
 def test_a_linear_system_says_which_signal_a_recording_lacks() -> None:
     system = subspace([driven_by_two()], 20, (4,))[4]
     with pytest.raises(rf.InputError, match=r"signal 'base \[m/s\^2\]' is needed.* has 'wind \[m/s\]';"):

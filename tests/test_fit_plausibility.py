@@ -4,10 +4,11 @@ import dataclasses
 
 import numpy as np
 import pytest
+import scipy.signal
 
 import rotflex_jax as rf
 from rotflex_jax.arena.simulator.records import make_record
-from rotflex_jax.fit.plausibility import check_signs
+from rotflex_jax.fit.plausibility import check_signs, motion
 
 JOINT = rf.Model(rf.joints.paper())
 
@@ -48,3 +49,15 @@ def test_rough_numbers_pass() -> None:
     for _ in range(20):
         values = JOINT.mechanism.values * 2.0 ** rng.uniform(-1, 1, len(JOINT.mechanism.values))
         check_signs(dataclasses.replace(JOINT, mechanism=JOINT.mechanism.with_values(values)), [recorded()])
+
+
+@pytest.mark.parametrize(("Ts", "width"), [(0.004, 9), (0.001, 31), (0.02, 5)])
+def test_positions_and_speeds_are_those_of_a_cubic_over_30_ms(Ts: float, width: int) -> None:
+    """Over an even number of sampling periods, at least four."""
+    y = np.random.default_rng(3).standard_normal((200, 2))
+    found = motion(JOINT.mechanism, y, Ts)
+    inside = slice(width, -width)
+    for port, of in (("hub", y[:, 0]), ("joint", y[:, 1]), ("arm", y.sum(axis=1))):
+        for order, values in enumerate(found[port]):
+            expected = scipy.signal.savgol_filter(of, width, 3, deriv=order, delta=Ts)
+            np.testing.assert_allclose(values[inside], expected[inside], rtol=1e-6, atol=1e-9)

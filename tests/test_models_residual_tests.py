@@ -152,6 +152,8 @@ def test_models_are_named_by_what_they_have_more() -> None:
     first, friction = Model(rf.joints.paper()), rf.effects.Coulomb(at="hub")
     assert "hub" in default_labels([first, first + friction])[1]
     assert default_labels([first + friction, first]) == ("model 1", "model 2")
+    other = first + rf.effects.LuGre(at="hub")  # one law in the place of the other
+    assert default_labels([first + friction, other]) == ("model 1", "model 2")
 
 
 @pytest.mark.parametrize(
