@@ -8,9 +8,11 @@ from scipy.linalg import expm
 
 import rotflex_jax as rf
 from rotflex_jax import Recording, fit, joints
-from rotflex_jax.effects import Motor
+from rotflex_jax.effects import Motor, Stribeck
 from rotflex_jax.errors import InputError
+from rotflex_jax.fit.held_constants import with_held_constants
 from rotflex_jax.models.model_json import read
+from rotflex_jax.parameters import Estimate
 
 K_T, DAMPER, EMF = "hub.motor.torque_constant", "hub.viscous.coefficient", "hub.motor.back_emf"
 NUMBERS = (PAPER := joints.paper()).named_values
@@ -99,3 +101,26 @@ def test_a_tied_constant_has_no_value_of_its_own() -> None:
     with pytest.raises(InputError, match="tied='yes'"):
         Motor(tied="yes")  # pyright: ignore[reportArgumentType]
     assert Motor(torque_constant=0.02, tied=True).back_emf == 0.02
+
+
+@pytest.mark.parametrize(("wide", "named"), [(0.999, True), (1.001, False)])
+def test_a_heavier_arm_scales_all_torques_and_no_speed(wide: float, named: bool) -> None:
+    """With an arm heavier by 1 %, a run is the same if every other torque is larger by 1 %.
+
+    The speed of a law is then the same. An arm that is wrong by 5 % is named where this moves an estimate by
+    more than half of its 95 % interval.
+    """
+    arm, speed = "arm.inertia.inertia", "hub.stribeck.speed"
+    friction = Stribeck("hub", level=0.01, excess=0.005, speed=0.4)
+    damped = joints.paper(hub_damping=0.004, joint_damping=0.003)
+    mechanism = damped.with_values({arm: 1e-4}) + friction
+    values, free = mechanism.named_values, mechanism.free_names
+    given = [
+        Estimate(name, v, wide * 0.05 * v / 1.959964, (0.0, 2 * v), "", free=name in free)
+        for name, v in values.items()
+    ]
+    found = {e.name: {c.name: c.change for c in e.given} for e in with_held_constants(mechanism, given)}
+    assert {"hub.stribeck.level", speed, "joint.spring.stiffness"} <= set(free)
+    for name in free:
+        change = pytest.approx(0.01 * values[name], rel=1e-4) if named and name != speed else None
+        assert found[name].get(arm) == change
