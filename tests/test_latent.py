@@ -20,7 +20,7 @@ from rotflex_jax.fit.dataset import StackedRecordings, sensor_noise
 from rotflex_jax.joints import emps, paper, single_inertia
 from rotflex_jax.latent import latent_torque, smoother
 from rotflex_jax.latent.figure import latent_maps, latent_time
-from rotflex_jax.latent.result import binned_mean
+from rotflex_jax.latent.result import binned_mean, latent_torque_result
 from rotflex_jax.latent.smoother import (
     AugmentedStep,
     InitialDistribution,
@@ -217,6 +217,21 @@ def test_the_intensity_is_that_of_scipy():
     assert gain == pytest.approx(cost([np.log(1e-12)], np.log(level[0])) - cost(np.log(level)), rel=1e-4)
 
 
+def test_the_variance_that_a_sample_adds_is_that_of_the_process(monkeypatch):
+    """For d' = -d / T + w of intensity 1, from a known d: T / 2 (1 - exp(-2 Ts / T)) after Ts."""
+
+    def made(**given):
+        raise RuntimeError(given["variance_growth"], given["time_constant"])
+
+    monkeypatch.setattr("rotflex_jax.latent.torque.IntensityEstimator", made)
+    r, _ = recorded(seconds=2.0)
+    with pytest.raises(RuntimeError) as stopped:
+        latent_torque(paper(**TRUE), [r, r.slice(0, 300)])
+    growth, T = stopped.value.args
+    assert pytest.approx(r.N * r.Ts, rel=0.01) == T
+    np.testing.assert_allclose(growth, -T / 2 * np.expm1(-2 * r.Ts / T), rtol=1e-12)
+
+
 # -- against the independent simulator ---------------------------------------------------------------
 
 
@@ -300,6 +315,30 @@ def test_other_parameters_need_no_compilation():
     counts = len(linearise_along), smoother._log_likelihoods._cache_size()
     latent_torque(paper(hub_damping=0.01, joint_damping=0.004), r)
     assert (len(linearise_along), smoother._log_likelihoods._cache_size()) == counts
+
+
+def test_torques_of_the_model_itself_and_the_spectrum_of_the_longest_recording():
+    """A spring and dampers pull back. The longest recording is the second one, at another sampling period."""
+    rng, made = np.random.default_rng(2), []
+    for N, Ts in ((400, 0.01), (2000, 0.004)):
+        u, y = rng.normal(size=N), rng.normal(size=(N, 2))
+        made.append(Recording(u=u, y=y, Ts=Ts, accept=("units",)))
+    S = rng.normal(size=(2, 2000, 6))
+    S[1, :, 4] = np.sin(2 * np.pi * 10.0 * made[1].t)  # torque at the hub
+    model, none = Model(paper(**TRUE)), np.zeros(2)
+    found = latent_torque_result(model, made, ("hub", "joint"), (S, 0 * S), none, none, 1.0)
+    theta_alpha, speeds = (np.concatenate([S[0, :400, k], S[1][:, k]]) for k in (slice(0, 2), slice(2, 4)))
+    stiffness = model.mechanism.named_values["joint.spring.stiffness"]
+    expected = {
+        "joint.spring": -stiffness * theta_alpha[:, 1],
+        "hub.viscous": -0.004 * speeds[:, 0],
+        "joint.viscous": -0.003 * speeds[:, 1],
+    }
+    assert set(found.linear) == set(expected)
+    for name, torque in expected.items():
+        np.testing.assert_allclose(found.linear[name], torque)
+    f, size = found.spectrum("hub")
+    assert f[np.argmax(size)] == pytest.approx(10.0, abs=f[1] - f[0])
 
 
 # -- curves and words ----------------------------------------------------------------------------------
