@@ -360,6 +360,12 @@ def test_a_stay_in_a_bin_counts_once():
     assert 0.01 < np.mean(misses) < 0.10
 
 
+def test_a_stay_ends_with_its_recording():
+    """The second recording begins in the bin in which the first one ends."""
+    x, recording = np.repeat([0.0, 1.0, 1.0, 0.0], 40), np.repeat([0, 0, 1, 1], 40)
+    assert binned_mean(x, x, 0 * x, 2, recording)["visits"].tolist() == [2, 2]
+
+
 def test_a_single_stay_has_a_wide_band():
     x = np.r_[np.tile(np.repeat([0.0, 1.0], 20), 50), np.full(30, 2.0)]
     torque = np.r_[np.repeat(np.random.default_rng(1).normal(size=100), 20), np.full(30, 3.0)]
