@@ -19,6 +19,7 @@ from rotflex_jax.errors import InputError
 from rotflex_jax.fit import least_squares
 from rotflex_jax.joints import paper
 from rotflex_jax.kernels import Kernels, average_kernels, effect_kernels, identified_kernels, local_kernels
+from rotflex_jax.kernels.average import _size_without_noise
 from rotflex_jax.kernels.figure import kernel_figure
 from rotflex_jax.kernels.sensitivities import output_derivatives
 from rotflex_jax.mechanism import Exponential, Mechanism, free_run, simulate
@@ -378,6 +379,14 @@ def test_a_linear_effect_changes_the_linear_kernel_by_an_exact_amount() -> None:
     assert np.isinf(share.z[0])
     assert "(exact), h2 by exactly nothing" in str(share)
     assert table.to_dict()["effects"][0]["standard_errors"] == [None, 0.0]
+
+
+def test_the_scatter_of_blocks_is_taken_out_of_a_size() -> None:
+    """Four blocks of 50 entries, each with noise of variance 1, about kernels of size 10."""
+    rng = np.random.default_rng(14)
+    blocks = np.sqrt(2.0) + rng.standard_normal((400, 4, 50))
+    squares = [_size_without_noise(each, np.linalg.norm) ** 2 for each in blocks]
+    assert np.mean(squares) == pytest.approx(100.0, abs=3 * np.std(squares) / 20)
 
 
 def test_gates_of_a_model_count() -> None:
