@@ -19,7 +19,7 @@ from rotflex_jax import effects as fx
 from rotflex_jax.cli import main
 from rotflex_jax.control import close_loop, controller_to_c, credible_models
 from rotflex_jax.control.assessment import ControlAssessment
-from rotflex_jax.control.closed_loop import run_loop
+from rotflex_jax.control.closed_loop import ClosedLoop, run_loop
 from rotflex_jax.control.design import AT_REST, Tracking, torques_along
 from rotflex_jax.errors import InputError
 from rotflex_jax.fit import Fit
@@ -290,6 +290,15 @@ def test_the_worst_model_has_the_largest_mean_square_error():
     assert str(report).splitlines()[2].split() == ["a", "held", "1.15", "1.72", "25.0"]
 
 
+def test_errors_and_limits_count_in_both_directions():
+    reference, position = np.zeros(4), np.array([0.3, -0.1, 0.0, 0.0])
+    controller, motion = SimpleNamespace(Ts=TS, limit=6.0), SimpleNamespace(reference=reference)
+    voltage, none = np.array([6.0, -6.0, 5.9, 0.0]), np.zeros((4, 0))
+    run = ClosedLoop(controller, motion, none, position, voltage, none, reference)  # pyright: ignore[reportArgumentType]
+    assert run.largest == pytest.approx(0.3) and run.rms == pytest.approx(np.sqrt(0.1 / 4))
+    assert run.saturated == 0.5
+
+
 def test_an_amplifier_that_remembers_longer_than_the_loop_is_refused():
     with pytest.raises(InputError, match="remember more than 128 samples"):
         close_loop(rf.controller(JOINT, TS), JOINT + fx.Lag(time=1.0), swing())
@@ -424,6 +433,23 @@ def test_models_are_drawn_from_the_distribution_of_the_fit():
     values = np.array([m.mechanism.values[index] for m in list(drawn.values())[1:]])
     np.testing.assert_allclose(np.cov(values.T), covariance, rtol=0.3, atol=1e-4)
     assert np.all(values[:, 0] >= 0)
+
+
+def test_what_has_no_interval_or_is_no_parameter_of_the_machine_is_not_drawn():
+    """An estimate at a bound has no covariance; an offset belongs to one recording."""
+    level, stiffness = "hub.coulomb.level", "joint.spring.stiffness"
+    names = ("offset of recording 1", level, stiffness)
+    covariance = np.full((3, 3), np.nan)
+    covariance[0, 0], covariance[2, 2], covariance[0, 2], covariance[2, 0] = 25.0, 1e-4, 0.0, 0.0
+    estimates = tuple(
+        Estimate(name=n, value=v, unit="", std=s, ci95=(0.0, 1.0), free=True)
+        for n, v, s in zip(names, (0.1, 0.1, 1.6), (5.0, np.nan, 0.01), strict=True)
+    )
+    fit = Fit(rf.Model(RUBBED), 0.0, "converged", estimates, {}, covariance, names, 1)
+    values = [m.mechanism.named_values for m in list(credible_models(fit, 200, seed=3).values())[1:]]
+    assert {v[level] for v in values} == {0.1}
+    spread = scipy.stats.chi2.ppf([0.001, 0.999], 199) / 199
+    assert spread[0] < np.var([v[stiffness] for v in values], ddof=1) / 1e-4 < spread[1]
 
 
 def test_a_draw_outside_of_a_bound_is_repeated():
