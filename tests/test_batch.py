@@ -22,6 +22,7 @@ import pytest
 
 import rotflex_jax as rf
 from rotflex_jax.batch import Fleet, fleet, page, storage, workers
+from rotflex_jax.batch.result import RecordingRow
 from rotflex_jax.batch.task import code_text
 from rotflex_jax.errors import InputError
 from rotflex_jax.runtime import xla
@@ -80,6 +81,30 @@ def test_every_recording_is_a_row_and_a_file_and_in_the_page(files, serial) -> N
     assert all(f"recordings/run_{k}.json" in text for k in range(6))
     # The page needs no other file: pictures and styles are in it.
     assert not re.search(r'(?:src|href)="(?!data:|recordings/)', text)
+
+
+def test_the_numbers_of_a_row_are_those_of_its_result_on_the_page_too(tmp_path) -> None:
+    """Errors of 40 and 2 times the noise; 1 rad is 57.3 deg."""
+    first = {"held_out_rmse_windows": {"theta": 0.04, "seconds": 2.0}, "held_out_rmse": {"theta": 0.08}}
+    last = {"held_out_rmse_windows": {"theta": 0.002, "seconds": 2.0}, "held_out_rmse": {"theta": 0.003}}
+    added = {"effect": "coulomb", "port": "hub", "equivalent": [{"effect": "dahl", "port": "hub"}]}
+    result = {"verdict": "ambiguous", "baseline": first, "rounds": [added | last]}
+    result |= {"noise_floor": {"theta": 1e-3}}
+    row = RecordingRow.of({"name": "a", "source": "a.csv", "reason": "", "seconds": 3.0, "result": result})
+    assert row.found == "coulomb@hub or dahl@hub" and row.window_seconds == 2.0
+    told = {"before": 0.04, "after": 0.002, "whole_before": 0.08, "whole_after": 0.003, "noise": 1e-3}
+    assert {what: row.flat(("theta",))[f"theta_{what}"] for what in told} == told
+    alone = dataclasses.replace(row, name="b", effects=(("coulomb", "hub", ()),), after={"theta": 0.0014})
+    both = Fleet((row, alone), 2, {"theta": "rad"}, tmp_path, 1.0)
+    assert both.effects == {("coulomb", "hub"): (1, 1), ("dahl", "hub"): (0, 1)}
+    assert [each["cells"] for each in page.content(both)["rows"]] == [
+        [{"before": "2.29", "after": "0.115", "times": "2.00", "ok": False}],
+        [{"before": "2.29", "after": "0.0802", "times": "1.40", "ok": True}],  # within 1.5 times the noise
+    ]
+    figure = page.errors(both)
+    assert figure is not None
+    points = figure.axes[0].lines[0]
+    np.testing.assert_allclose([points.get_xdata(), points.get_ydata()], [[40.0, 40.0], [2.0, 1.4]])
 
 
 def test_the_order_does_not_matter(files, serial, tmp_path) -> None:
