@@ -44,11 +44,14 @@ from rotflex_jax.joints import paper, single_inertia
 from rotflex_jax.latent import LatentTorque
 from rotflex_jax.mechanism.quantity import Units
 from rotflex_jax.models.model import Model
+from rotflex_jax.models.residual_tests import FrequencyResponse, residual_tests
 from rotflex_jax.parameters import Estimate
 from rotflex_jax.recording import Recording
 from rotflex_jax.report import parameter_table, summary_table, write_report
 from rotflex_jax.report.figures import pictures
-from rotflex_jax.report.figures.failure import profiles
+from rotflex_jax.report.figures.evidence import parameters, staircase
+from rotflex_jax.report.figures.failure import _maps, profiles, worst_channel
+from rotflex_jax.report.figures.residuals import residual_figure, response_figure
 from rotflex_jax.report.page import render
 
 NASTY = "bench <script>alert(1)</script> & 'co'.csv"
@@ -450,6 +453,77 @@ def test_errors_after_reversals_are_drawn_to_the_last(discovery) -> None:
     assert len(ax.patches) >= len(place.profile) == len(place.edges) - 1
     assert sum(place.profile) == pytest.approx(1) and sum(place.expected) == pytest.approx(1)
     assert [label.get_text() for label in ax.get_xticklabels()][-1] == "later"
+
+
+def test_shares_of_the_error_are_drawn_in_percent(discovery) -> None:
+    figure = profiles(discovery)
+    assert figure is not None
+    bars = [b.get_height() for b in figure.axes[0].patches[:4]]
+    assert bars == pytest.approx([40.0, 20.0, 18.0, 22.0]) and figure.axes[0].get_ylabel() == "share [%]"
+
+
+def test_estimates_are_drawn_relative_to_the_last_with_their_intervals(discovery) -> None:
+    """Intervals of the last model are 1.96 standard deviations; the spring of the first is softer by 5 %."""
+    first = discovery.baseline
+    softer = tuple(
+        dataclasses.replace(e, value=0.95 * e.value) if e.name == "joint.spring.stiffness" else e
+        for e in first.estimates
+    )
+    figure = parameters(dataclasses.replace(discovery, baseline=dataclasses.replace(first, estimates=softer)))
+    assert figure is not None
+    (ax,) = figure.axes
+    rows = {text.get_text(): k for k, text in enumerate(ax.get_yticklabels())}
+    drawn = [(c.lines[0].get_xydata()[0], c.lines[2][0].get_segments()[0]) for c in ax.containers]
+    spring = [(x, ends[:, 0]) for (x, y), ends in drawn if round(y) == rows["joint.spring.stiffness"]]
+    last = {e.name: e for e in discovery.final.estimates}["joint.spring.stiffness"]
+    assert [x for x, _ in spring] == pytest.approx([-5.0, 0.0, 0.0])
+    assert spring[-1][1] == pytest.approx(np.array([-196.0, 196.0]) * last.std / last.value, rel=1e-4)
+
+
+def test_the_noise_of_a_sensor_is_drawn_in_the_unit_of_the_axis(discovery) -> None:
+    figure = staircase(discovery)
+    assert figure is not None
+    (floor,) = (line for line in figure.axes[0].lines if line.get_label() == "sensor noise")
+    assert floor.get_ydata()[0] == pytest.approx(np.rad2deg(NOISE))
+
+
+def test_the_worst_channel_is_that_of_the_largest_error_over_its_noise(discovery) -> None:
+    """Errors of 0.035 and 0.007 rad."""
+    assert worst_channel(discovery) == "theta"
+    coarse = dataclasses.replace(discovery, noise_floor={"theta": 1e-2, "alpha": 1e-4})
+    assert worst_channel(coarse) == "alpha"
+
+
+def test_maps_are_over_the_speed_and_have_the_acceleration_that_is_lacking(discovery) -> None:
+    """The baseline lacks a sine of 0.3 Hz in the angle, the last model nothing but noise."""
+    m, t = _maps(discovery), discovery.validation[0].t
+    speed = 0.4 * 2 * np.pi * 0.7 * np.cos(2 * np.pi * 0.7 * t)
+    speed += 0.1 * 2 * np.pi * 1.9 * np.cos(2 * np.pi * 1.9 * t + 1)
+    inside = slice(50, -50)
+    np.testing.assert_allclose(np.deg2rad(m.over[0])[inside], speed[inside], atol=0.15)
+    assert m.labels == ["speed of theta [deg/s]", "alpha [deg]"]
+    before, after = m.lacking.values()
+    sine = -((2 * np.pi * 0.3) ** 2) * 0.05 * np.sin(2 * np.pi * 0.3 * t)
+    known = np.isfinite(before) & np.isfinite(after)
+    difference = np.deg2rad(before - after)[known]  # the noise of both is the same
+    np.testing.assert_allclose(difference, sine[known], atol=0.1 * np.abs(sine).max())
+    assert m.usual == pytest.approx(np.std(after[known]), rel=0.2)
+
+
+def test_lags_are_drawn_in_milliseconds_and_phases_within_half_a_turn_of_the_measured_one() -> None:
+    rng = np.random.default_rng(4)
+    tests = residual_tests(rng.standard_normal((500, 1)), rng.standard_normal(500), 0.004, ["theta"])
+    own, cross = residual_figure({"baseline": tests}).axes
+    assert own.lines[0].get_xdata()[3] == pytest.approx(12.0)
+    assert cross.lines[0].get_xdata()[[0, -1]] == pytest.approx([-100.0, 100.0])
+    f, one = np.array([1.0, 2.0, 4.0]), np.ones((1, 3))
+    measured, simulated = (
+        FrequencyResponse(f, np.exp(1j * np.deg2rad([degrees])), one)
+        for degrees in ([-20.0, -170.0, 170.0], [-30.0, 175.0, 160.0])
+    )
+    axes = response_figure(measured, {"model": simulated}, {"theta": "rad"}, "V").axes
+    phases = [line.get_ydata() for line in axes[1].lines]
+    np.testing.assert_allclose(phases, [[-20.0, -170.0, -190.0], [-30.0, -185.0, -200.0]])
 
 
 def test_figures_leave_the_settings_of_matplotlib_alone(discovery) -> None:
