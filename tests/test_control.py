@@ -299,6 +299,15 @@ def test_errors_and_limits_count_in_both_directions():
     assert run.saturated == 0.5
 
 
+@pytest.mark.parametrize(("reference", "rests"), [([0, 1, 2, 1, 0, 0], False), ([0, 1, 0, 0, 0, 0], True)])
+def test_a_run_rests_after_its_last_motion(reference, rests):
+    """For at least a second, not from when the reference has had its last value before."""
+    controller, motion = SimpleNamespace(Ts=0.4), SimpleNamespace(reference=np.array(reference, float))
+    still, none = np.zeros(6), np.zeros((6, 0))
+    run = ClosedLoop(controller, motion, none, still, still, none, still)  # pyright: ignore[reportArgumentType]
+    assert run.rests is rests
+
+
 def test_an_amplifier_that_remembers_longer_than_the_loop_is_refused():
     with pytest.raises(InputError, match="remember more than 128 samples"):
         close_loop(rf.controller(JOINT, TS), JOINT + fx.Lag(time=1.0), swing())

@@ -116,6 +116,12 @@ def second_order(k2: float, u: np.ndarray) -> float:
     return float(state[22])
 
 
+def test_a_voltage_acts_for_five_memories_before_the_kernels() -> None:
+    """The hub turns on: its angle tells for how long. The last memory is that of the kernels themselves."""
+    found = local_kernels(paper(), Ts, "theta", 4, voltage=1.0)
+    assert found.h0 == pytest.approx(simulate(paper(), np.ones(24), Ts)[-1, 0], rel=1e-9)
+
+
 def test_quadratic_spring_has_the_kernel_of_its_second_order_perturbation() -> None:
     found = local_kernels(model(SPRING, substeps=16, order=4), Ts, "alpha", MEMORY).h2
     pulse = np.eye(MEMORY)[:, ::-1][:, :-1]  # row k: a pulse k samples before the output
@@ -233,7 +239,11 @@ CASES = {
 def test_least_squares_finds_the_average_kernels(case: str) -> None:
     m, u = model(*CASES[case]), white(3)
     kernels = average_kernels(m, u, "alpha", MEMORY, Ts=Ts)
-    agreement = kernels.against(by_numpy(u, alpha(m, u)))
+    other = by_numpy(u, alpha(m, u))
+    agreement = kernels.against(other)
+    assert abs(kernels.h0 - other.h0) < 4 * np.hypot(kernels.h0_std, other.h0_std)
+    if case == "quadratic spring":  # the mean of the output is the constant and that of the squares
+        assert abs(np.mean(alpha(m, u)) - other.h0) > 10 * np.hypot(kernels.h0_std, other.h0_std)
     assert agreement.rms[0] < 2.5  # a dead zone scales all lags alike: one random error, not six
     assert 0.6 < agreement.rms[1] < 1.5
     quadratic = kernels.against(average_kernels(paper(), u, "alpha", MEMORY, Ts=Ts)).rms[1]
@@ -269,6 +279,14 @@ def test_least_squares_finds_them_under_a_coloured_input_and_a_short_memory() ->
     # The input correlates later lags with these, so leaving later lags out changes the kernel.
     without = average_kernels(m, u, "alpha", memory, Ts=Ts, reach=memory)
     assert np.max(np.abs(without.h1 - kernels.h1)) > 10 * np.max(kernels.errors[0])
+
+
+def test_an_input_that_is_not_gaussian_is_told_with_its_kurtosis() -> None:
+    """Uniform numbers have the excess kurtosis -1.2."""
+    rng = np.random.default_rng(15)
+    even = average_kernels(paper(), rng.uniform(-1, 1, 4000), "alpha", MEMORY, Ts=Ts)
+    assert "far from Gaussian" in even.note and "excess kurtosis -1.2" in even.input
+    assert average_kernels(paper(), rng.normal(size=4000), "alpha", MEMORY, Ts=Ts).note == ""
 
 
 def test_friction_damps_the_linear_kernel() -> None:
@@ -455,6 +473,13 @@ def test_sizes_are_standard_deviations_under_a_gaussian_input(a: float) -> None:
     white = np.random.default_rng(14).normal(size=400_000)
     y = kernels.response(lfilter([np.sqrt(1 - a**2)], [1, -a], white))
     assert np.std(y) == pytest.approx(np.hypot(*kernels.sizes), rel=0.01)
+
+
+def test_each_entry_of_a_symmetric_kernel_counts_once_in_an_agreement() -> None:
+    """Differences of 2, 1 and 0 standard errors, two of them on the diagonal."""
+    one = Kernels("alpha", Ts, 0.0, np.zeros(2), np.zeros((2, 2)), h2_std=np.full((2, 2), 0.1))
+    other = dataclasses.replace(one, h2=np.array([[0.2, 0.1], [0.1, 0.0]]), h2_std=None)
+    assert one.against(other).rms[1] == pytest.approx(np.sqrt((4 + 1 + 0) / 3))
 
 
 def test_kernels_about_two_levels_agree_if_one_is_the_other_one_moved() -> None:
