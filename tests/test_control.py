@@ -235,6 +235,21 @@ def test_the_observed_load_is_the_one_that_acts(compensate):
         assert run.error[-1] == pytest.approx(-volts / found.K[0], rel=0.02)
 
 
+def test_the_observed_states_are_those_of_the_machine():
+    """A load moves it away from the plan."""
+    seen = []
+
+    class Watched(Linear):
+        def read(self) -> NDArray[np.float64]:
+            seen.append(self.x)
+            return super().read()
+
+    run = close_loop(rf.controller(JOINT, TS, resolution=EXACT), Watched(load=0.02), swing())
+    off = np.abs(run.states - np.array(seen))[500:].max(axis=0)
+    from_plan = np.abs(run.motion.states - np.array(seen))[500:].max(axis=0)
+    assert np.all(off[:2] < 0.1 * from_plan[:2])
+
+
 def test_friction_is_compensated_along_the_motion():
     run = {
         c: close_loop(rf.controller(RUBBED, TS, compensate=c), RUBBED, swing())

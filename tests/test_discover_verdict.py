@@ -212,3 +212,10 @@ def test_the_misfit_is_what_is_left_over_what_the_verdict_allows() -> None:
 
     assert misfit(3.0, 2.0) == pytest.approx(9.0) and misfit(0.9, 2.0) == pytest.approx(2.0)
     assert misfit(0.9, 0.9) == 1.0 and misfit(NAN, 0.0) == np.inf
+
+
+@pytest.mark.parametrize("verdict", Verdict)
+def test_candidates_that_could_not_have_shown_are_said_where_the_verdict_does_not_say_it(verdict: Verdict):
+    said = [step for step in verdict.next_steps([("a", "b")], 3, 7) if step.startswith("3 of 7 candidates")]
+    assert len(said) == (verdict is not Verdict.NOT_EXCITED)
+    assert not any("candidates could not" in step for step in verdict.next_steps([("a", "b")], 0, 7))

@@ -163,6 +163,23 @@ def test_limits_on_voltage_and_slew_hold_exactly_and_change_nothing_needlessly()
     np.testing.assert_allclose(limits.playable(jump, Ts)[50:150], (below + above)[50:150] / 2, atol=1e-9)
 
 
+def test_standard_inputs_have_the_bands_that_they_name_and_no_constant_part():
+    """Noise of a corner f has the correlation exp(-2 pi f Ts) of neighbours; bands end at 0.4 / Ts."""
+    fast = standard_inputs(8000, 0.005, Limits(voltage=5.0))
+    for made in (i for i in fast if i.kind == "noise"):
+        corner = float(made.setting.removesuffix(" Hz"))
+        correlation = np.corrcoef(made.u[1:], made.u[:-1])[0, 1]
+        assert correlation == pytest.approx(np.exp(-2 * np.pi * corner * 0.005), abs=0.03)
+        assert abs(np.mean(made.u)) < 0.02
+    slow = [i for i in standard_inputs(1000, 0.02, Limits(voltage=5.0)) if i.kind == "multisine"]
+    assert [i.setting for i in slow] == ["to 6 Hz", "to 12 Hz", "to 20 Hz"]
+    f = np.fft.rfftfreq(1000, 0.02)
+    for made, high in zip(slow, (6.0, 12.0, 20.0), strict=True):
+        power = np.abs(np.fft.rfft(made.u)) ** 2
+        assert np.sum(power[f > 1.01 * high]) < 1e-3 * np.sum(power)
+        assert np.sum(power[f > 0.8 * high]) > 0.05 * np.sum(power)
+
+
 def test_a_tenth_of_a_second_has_all_standard_inputs():
     """One period in 0.1 s is 10 Hz, above the highest frequency of one of the multisines and sweeps."""
     kinds = [[s.kind for s in standard_inputs(N, 5e-4, Limits(voltage=5.0))] for N in (200, 20_000)]
