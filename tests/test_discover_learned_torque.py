@@ -4,6 +4,7 @@ import dataclasses
 import importlib
 import json
 import re
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -261,6 +262,7 @@ def test_friction_is_learned_and_read(friction):
     truth = -0.03 * np.sign(w) - line[0] - line[1] * w
     assert np.sqrt(np.mean((mean - truth) ** 2)) < 0.1 * 0.03
     assert np.mean(np.abs(mean - truth) < 3 * std + 0.05 * 0.03) > 0.8
+    assert 0.5 < np.sqrt(np.mean(((mean - truth) / std) ** 2)) < 2.0  # errors are as large as the band says
     np.testing.assert_allclose(found.read_torque(0 * w, w), truth, atol=0.1 * 0.03)
     # Nothing is left for the damper or an offset to explain.
     inside = found.torque(found.position, found.speed)[0]
@@ -298,6 +300,13 @@ def test_a_map_that_does_not_gain_surely_enough_is_told_in_plain_json(small_map,
     found = taught({("coulomb", "hub"): {"level": 0.03}})
     assert found.held_out_gain_nats > learned.HELD_OUT_NATS and not found.kept
     assert json.loads(json.dumps(found.to_dict()))["kept"] is False  # as a report writes it beside its page
+
+
+def test_a_cell_is_visited_by_three_samples():
+    moved = SimpleNamespace(position=np.array([0.5, 0.5, 1.5, 1.5, 1.5]), speed=np.full(5, 0.5))
+    edges = [np.array([0.0, 1.0, 2.0]), np.array([0.0, 1.0])]
+    visited = learned.LearnedTorqueResult.visited(moved, edges)
+    np.testing.assert_array_equal(visited, [[False], [True]])
 
 
 def test_ports_that_cannot_be_taught_are_told():

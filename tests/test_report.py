@@ -550,6 +550,7 @@ def test_the_missing_torque_is_shown_and_what_was_learned(discovery, page, monke
     assert "At the joint the baseline lacks nothing that could be seen" in text
     assert "τ = −0.0300 sign(w)" in text or "τ = −0.03 sign(w)" in text
     assert "98 %" in text and "755 nat" in text
+    assert "(98 % of what the map explains)" in str(map_of_friction(discovery, True))
     assert grown.count("<figure>") == page.count("<figure>") + 3
     monkeypatch.setattr("rotflex_jax.report.page.pictures", lambda *given: {})  # only text is checked below
     without = read(render(discovery, Explanation(latent, map_of_friction(discovery, False)))).text
