@@ -58,12 +58,18 @@ FEW = {
 
 
 def places(case: str) -> list[tuple[type[fx.Effect], str]]:
-    """All candidates of a search that the baseline lacks; a few of them for dry friction."""
+    """Each effect of a search at one place where the baseline lacks it; a few of them for dry friction.
+
+    The place is the first for one effect, the second for the next, and so on.
+    """
     has = {(e.name, e.at) for e in BASELINES[case].effects}
     pairs = [(cls, port) for cls, port in search_places(BASELINES[case]) if (cls.name, port) not in has]
     # A gear with a gap of zero has no derivative.
     pairs = [pair for pair in pairs if not issubclass(pair[0], fx.Gear)]
-    return [pair for pair in pairs if case != "dry friction" or (pair[0].name, pair[1]) in FEW]
+    if case == "dry friction":
+        return [(cls, port) for cls, port in pairs if (cls.name, port) in FEW]
+    ports = {cls: [at for other, at in pairs if other is cls] for cls in dict.fromkeys(c for c, _ in pairs)}
+    return [(cls, at[k % len(at)]) for k, (cls, at) in enumerate(ports.items())]
 
 
 @dataclasses.dataclass(frozen=True)
