@@ -1,6 +1,7 @@
 """A reversed sign of a channel or the input is refused; right signs and rough parameters are accepted."""
 
 import dataclasses
+import functools
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from rotflex_jax.fit.plausibility import check_signs, motion
 JOINT = rf.Model(rf.joints.paper())
 
 
+@functools.cache
 def recorded(u: float = 1, theta: float = 1, alpha: float = 1, kind: str = "noise") -> rf.Recording:
     """A joint with friction and a voltage offset, by the independent simulator; signs as given."""
     hidden = [("coulomb", "hub"), ("voltage_offset", "input")]
