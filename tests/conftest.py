@@ -2,6 +2,7 @@
 
 import contextlib
 import gc
+import importlib
 import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -53,6 +54,16 @@ def measured() -> Callable[[str], list[Recording]]:
         return load_dataset(name)
 
     return load
+
+
+@pytest.fixture
+def without_final_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Searches end without the fit to training and validation data, which takes up to half of their time.
+
+    For tests that are not about it; `test_discover_final_fit.py` has those that are.
+    """
+    summary = importlib.import_module("rotflex_jax.discover.summary")
+    monkeypatch.setattr(summary, "fit_to_all", lambda *_: None)
 
 
 _raises = pytest.raises

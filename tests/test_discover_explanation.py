@@ -90,6 +90,7 @@ def with_noise(run: rf.Recording, noise: np.ndarray) -> rf.Recording:
     return dataclasses.replace(run, y=run.y + noise[:, None])
 
 
+@pytest.mark.usefixtures("without_final_fit")
 def test_the_next_steps_of_a_verdict_say_so() -> None:
     """They name an AR(1) for a right model with a noisy tacho, and not for a model that lacks friction."""
     joint = SPINDLE + rf.effects.Coulomb(at="shaft")

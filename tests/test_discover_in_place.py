@@ -176,6 +176,7 @@ def found_beside(size: float) -> Discovery:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("without_final_fit")
 def test_a_law_is_decided_where_nothing_else_is_missing_and_open_where_much_is():
     (alone,) = found_beside(0.0).rounds
     assert (alone.effect, alone.port) == LAW and not alone.equivalent and alone.status == "established"

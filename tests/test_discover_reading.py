@@ -22,6 +22,8 @@ from rotflex_jax.discover.reading import (
 from rotflex_jax.effects import Coulomb, LuGre, Stribeck
 from rotflex_jax.fit.dataset import Dataset, StackedRecordings
 
+pytestmark = pytest.mark.usefixtures("without_final_fit")
+
 FAST, SLOW, SECONDS = 1000, 100, 12.0
 FRICTIONS = [(Coulomb, "hub"), (Stribeck, "hub"), (LuGre, "hub")]
 

@@ -224,6 +224,7 @@ def test_other_values_make_no_more() -> None:
     assert others <= FITTED
 
 
+@pytest.mark.usefixtures("without_final_fit")
 def test_dry_friction_is_tried_where_other_candidates_have_crowded_it_out(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

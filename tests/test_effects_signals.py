@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -138,7 +139,10 @@ def test_slopes_equal_central_differences(solver):
         P = len(values)
         ways = TangentDirections(jnp.eye(P), jnp.zeros((P, len(m.effects))), jnp.zeros((P, 4)))
         samples = RecordingSamples(jnp.asarray(w), jnp.zeros((120, 2)), jnp.ones(120), jnp.asarray(TS))
-        y, J = outputs_with_sensitivities(structure, solver, parameters, ways, samples)
+        # The program runs once, so optimising it takes longer than it saves.
+        rough = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
+        slopes = jax.jit(outputs_with_sensitivities, static_argnums=(0, 1), compiler_options=rough)
+        y, J = slopes(structure, solver, parameters, ways, samples)
     np.testing.assert_allclose(y, run(values), atol=1e-12)
     for name in m.free_names:
         i = m.parameter_names.index(name)
@@ -224,13 +228,14 @@ CANDIDATES = [
 ]
 
 
-def test_a_search_names_the_signal_that_acts_and_no_other_one(measured):
+def test_a_search_names_the_signal_that_acts_and_no_other_one(measured, request):
     """The moving base is found if it acts; the same signal is not added to data of a base at rest."""
     model = joint(Coulomb(at="hub", level=0.01)).trust("arm.inertia.inertia")
     train, validation = measured.split(0.6)
     found = rf.discover(model, train, validation, candidates=CANDIDATES, rounds=1)
     assert [(r.effect, r.port) for r in found.rounds] == [("measured_disturbance", f"arm: {BASE}")]
     assert found.model.mechanism.signals == (BASE,)
+    request.getfixturevalue("without_final_fit")
     whole = moving_base(measured.u, np.zeros(measured.N), friction=0.02)
     still = dataclasses.replace(
         measured, y=whole + np.random.default_rng(14).normal(scale=2e-4, size=whole.shape)

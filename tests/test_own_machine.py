@@ -180,6 +180,7 @@ def test_fit_of_ones_own_machine_recovers_its_numbers():
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("without_final_fit")
 def test_discovery_finds_what_is_hidden_in_ones_own_machine(magnetic_brake):
     """The first round finds a user's own effect at the right port, before the friction at the same port.
 
