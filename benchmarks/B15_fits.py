@@ -35,7 +35,7 @@ import numpy as np
 import rotflex_jax as rf
 from B0_discovery import save
 from origin import begin, part
-from rotflex_jax.arena.measured import MACHINES, Direction
+from rotflex_jax.arena.measured import MACHINES, MeasuredDirection
 from rotflex_jax.effects import CATALOG
 from rotflex_jax.metrics import windowed_rmse
 from rotflex_jax.recording.recording import joined
@@ -44,7 +44,7 @@ LAWS = ("coulomb", "dahl", "stribeck", "lugre")
 OFFSET, SECONDS = "input.voltage_offset.offset", 2.0
 
 
-def fits(base: rf.Model, direction: Direction, law: str) -> list[dict[str, Any]]:
+def fits(base: rf.Model, direction: MeasuredDirection, law: str) -> list[dict[str, Any]]:
     """A model with one law of friction, fitted without and with restarts."""
     m = base.mechanism + CATALOG[law](at="hub" if "hub" in base.mechanism.port_vectors else "axis")
     if OFFSET not in m.parameter_names:

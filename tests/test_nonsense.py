@@ -800,7 +800,6 @@ def test_what_no_float_can_hold_is_refused():
         (2 + 0j, r".2.0j."),
         ([2.0], "a list"),
         (np.array([2.0]), "a ndarray"),
-        (jnp.array([2.0]), "an ArrayImpl"),
         (pd.Series([2.0]), "a Series"),
         (np.array("2"), "'2'"),
         (np.ma.masked, "a MaskedConstant"),
@@ -811,12 +810,11 @@ def test_a_parameter_that_is_no_number_is_refused(value: Any, shown: str) -> Non
         rf.effects.Coulomb(at="hub", level=value)
 
 
-@pytest.mark.parametrize("kind", [np.array, jnp.array, jnp.float32])
-def test_an_array_of_no_axis_is_a_number(kind: Any) -> None:
-    made = rf.effects.Coulomb(at="hub", level=kind(0.25))
+def test_an_array_of_no_axis_is_a_number() -> None:
+    made = rf.effects.Coulomb(at="hub", level=cast(Any, np.array(0.25)))
     assert made == rf.effects.Coulomb(at="hub", level=0.25) and hash(made) == hash(made.replace(level=0.25))
     with pytest.raises(rf.InputError, match=r"level=-0.25 N m, but it needs a finite value"):
-        rf.effects.Coulomb(at="hub", level=kind(-0.25))
+        rf.effects.Coulomb(at="hub", level=cast(Any, np.array(-0.25)))
 
 
 def test_constants_of_a_recording_are_floats() -> None:

@@ -15,7 +15,7 @@ from typing import Any
 import rotflex_jax as rf
 from evaluation import errors, named, searched
 from public_machines.rounds import estimates
-from rotflex_jax.arena.measured import MACHINES, Direction
+from rotflex_jax.arena.measured import MACHINES, MeasuredDirection
 
 
 def main() -> None:
@@ -99,7 +99,7 @@ def reported(stage: dict[str, Any]) -> dict[str, Any]:
 
 
 def compared(
-    model: rf.Model, direction: Direction, methods: Sequence[str], say: Callable[[str], None]
+    model: rf.Model, direction: MeasuredDirection, methods: Sequence[str], say: Callable[[str], None]
 ) -> dict[str, Any]:
     """Other methods, fitted to training and validation recordings and evaluated on the test, best first."""
     began = time.perf_counter()

@@ -17,7 +17,7 @@ SILVERBOX_SAMPLES = 16_000
 
 
 @dataclass(frozen=True)
-class Direction:
+class MeasuredDirection:
     """Which recordings are fitted, which decide, and on which the result is evaluated.
 
     Args:
@@ -51,7 +51,7 @@ class Machine:
 
     dataset: str
     preset: str
-    make_directions: Callable[[list[rf.Recording]], list[Direction]]
+    make_directions: Callable[[list[rf.Recording]], list[MeasuredDirection]]
     options: Mapping[str, Any] = field(default_factory=dict)
     unit: str = "deg"
     factor: float = math.degrees(1.0)
@@ -64,24 +64,24 @@ class Machine:
         mechanism = getattr(rf.joints, self.preset)(**self.options).release(*self.released)
         return rf.Model(mechanism) if self.solver is None else rf.Model(mechanism, self.solver)
 
-    def directions(self) -> list[Direction]:
+    def directions(self) -> list[MeasuredDirection]:
         """All directions; this loads the recordings."""
         return self.make_directions(rf.data.load_dataset(self.dataset))
 
 
-def learned(name: str, runs: Sequence[rf.Recording], test: Sequence[rf.Recording]) -> Direction:
+def learned(name: str, runs: Sequence[rf.Recording], test: Sequence[rf.Recording]) -> MeasuredDirection:
     """Fit to the beginnings of runs, validation on their ends, and evaluation on other recordings."""
     parts = [r.split(SHARE) for r in runs]
-    return Direction(name, tuple(a for a, _ in parts), tuple(b for _, b in parts), tuple(test))
+    return MeasuredDirection(name, tuple(a for a, _ in parts), tuple(b for _, b in parts), tuple(test))
 
 
-def halves(run: rf.Recording) -> Direction:
+def halves(run: rf.Recording) -> MeasuredDirection:
     """Learn from the first half of a run and evaluate on the second half."""
     first, second = run.split(0.5)
     return learned("first half to second half", [first], [second])
 
 
-def together(runs: Sequence[rf.Recording]) -> Direction:
+def together(runs: Sequence[rf.Recording]) -> MeasuredDirection:
     """Learn from the beginnings of all runs and evaluate on their ends."""
     parts = [r.split(SHARE) for r in runs]
     return learned(
@@ -89,14 +89,14 @@ def together(runs: Sequence[rf.Recording]) -> Direction:
     )
 
 
-def crossed(runs: Mapping[str, rf.Recording]) -> list[Direction]:
+def crossed(runs: Mapping[str, rf.Recording]) -> list[MeasuredDirection]:
     """From each run to the others, then all runs together.
 
     With two runs, the end of the first is for validation and the other run is the test; or the first half of
     the other run is for validation and its second half is the test. With three runs, the next one is for
     validation and the third is the test.
     """
-    names, directions = list(runs), list[Direction]()
+    names, directions = list(runs), list[MeasuredDirection]()
     for k, name in enumerate(names):
         run, following = runs[name], names[(k + 1) % len(names)]
         if len(names) == 2:
@@ -104,16 +104,16 @@ def crossed(runs: Mapping[str, rf.Recording]) -> list[Direction]:
             directions.append(learned(f"{name} to {following}", [run], [other]))
             decides, tests = other.split(0.5)
             directions.append(
-                Direction(f"{name} and half of {following} to the rest", (run,), (decides,), (tests,))
+                MeasuredDirection(f"{name} and half of {following} to the rest", (run,), (decides,), (tests,))
             )
         else:
             last = {n: r for n, r in runs.items() if n not in (name, following)}
             title = f"{name}, decided on {following}, to {' and '.join(last)}"
-            directions.append(Direction(title, (run,), (runs[following],), tuple(last.values())))
+            directions.append(MeasuredDirection(title, (run,), (runs[following],), tuple(last.values())))
     return [*directions, together(list(runs.values()))]
 
 
-def _emps(_: list[rf.Recording]) -> list[Direction]:
+def _emps(_: list[rf.Recording]) -> list[MeasuredDirection]:
     # The test record has force pulses, which the training record lacks. It is used for the errors only.
     official = rf.data.benchmark("emps")
     return [
@@ -122,20 +122,20 @@ def _emps(_: list[rf.Recording]) -> list[Direction]:
     ]
 
 
-def _silverbox(_: list[rf.Recording]) -> list[Direction]:
+def _silverbox(_: list[rf.Recording]) -> list[MeasuredDirection]:
     official = rf.data.benchmark("silverbox")
     train = official.train.slice(0, SILVERBOX_SAMPLES)
     return [learned("official", [train], list(official.tests.values())), halves(train)]
 
 
-def by_itself(name: str, run: rf.Recording) -> Direction:
+def by_itself(name: str, run: rf.Recording) -> MeasuredDirection:
     """Learn from the first half of a run, validate on the part after it, and evaluate on the end."""
     train, rest = run.split(0.5)
     decides, tests = rest.split(2 * SHARE - 1)
-    return Direction(f"{name}, first half to its end", (train,), (decides,), (tests,))
+    return MeasuredDirection(f"{name}, first half to its end", (train,), (decides,), (tests,))
 
 
-def _two_runs(runs: Sequence[rf.Recording]) -> list[Direction]:
+def _two_runs(runs: Sequence[rf.Recording]) -> list[MeasuredDirection]:
     """Two runs of the serial link, with LQR and with state feedback: each run alone, and across the runs.
 
     The runs are fifteen years apart, with different friction and amplifiers. A single run shows what a model
@@ -145,22 +145,22 @@ def _two_runs(runs: Sequence[rf.Recording]) -> list[Direction]:
     return [*(by_itself(name, run) for name, run in named.items()), *crossed(named)]
 
 
-def _stage(stage: int, beside_the_other: bool) -> Callable[[list[rf.Recording]], list[Direction]]:
+def _stage(stage: int, beside_the_other: bool) -> Callable[[list[rf.Recording]], list[MeasuredDirection]]:
     """One stage of the serial link, with or without the acceleration of the other link as a signal."""
 
-    def directions(runs: list[rf.Recording]) -> list[Direction]:
+    def directions(runs: list[rf.Recording]) -> list[MeasuredDirection]:
         own = runs[stage - 1 :: 2]
         return _two_runs(own if beside_the_other else [r.with_signals({}) for r in own])
 
     return directions
 
 
-def _both_stages(runs: list[rf.Recording]) -> list[Direction]:
+def _both_stages(runs: list[rf.Recording]) -> list[MeasuredDirection]:
     """Both stages of the serial link as one machine."""
     return _two_runs([stages_together(*runs[k : k + 2]) for k in (0, 2)])
 
 
-def _by_gain(runs: list[rf.Recording]) -> list[Direction]:
+def _by_gain(runs: list[rf.Recording]) -> list[MeasuredDirection]:
     """Servo with four gains and three motions for each: from the lower gains to the highest, and back."""
     low, high = runs[:9], runs[9:]
     return [
@@ -169,7 +169,7 @@ def _by_gain(runs: list[rf.Recording]) -> list[Direction]:
     ]
 
 
-def _elbow(runs: list[rf.Recording]) -> list[Direction]:
+def _elbow(runs: list[rf.Recording]) -> list[MeasuredDirection]:
     """One servo of the arm: from random motion to steps, and back."""
     own = {r.source.split(",")[0]: r for r in runs if ", Elbow" in r.source}
     random = [own["multisine"], own["prbs_excitation"]]

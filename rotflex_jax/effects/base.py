@@ -19,7 +19,6 @@ from typing import Any, ClassVar, Literal, NamedTuple, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Float, Real
 
 from rotflex_jax.checks import known_arguments, shown
@@ -233,16 +232,17 @@ class Effect(abc.ABC):
             value = getattr(self, name)
             if value is None and getattr(type(self), name) is None:
                 continue  # an optional part that the instance does not have
-            plain = not isinstance(value, Tracer) and not np.ma.is_masked(value)
-            if plain and isinstance(value, np.ndarray | jax.Array) and value.ndim == 0:
-                value = value.item()  # an array has no hash, a number has one
+            if isinstance(value, np.ndarray) and value.ndim == 0:
+                value = value[()]  # an array has no hash, a number has one
                 object.__setattr__(self, name, value)
-            if isinstance(value, _NO_NUMBERS) or (plain and getattr(value, "ndim", 0)):
+            # Arrays of JAX may be derivatives, which have any size and shape.
+            vector = getattr(value, "ndim", 0) > 0 and not isinstance(value, jax.Array)
+            if vector or isinstance(value, _NO_NUMBERS):
                 raise InputError(
                     f"{kind} was given {name}={shown(value)}, but it needs a number"
                     f"{f' in {spec.unit}' if spec.unit else ''}; give one."
                 )
-            if not isinstance(value, numbers.Real):
+            if isinstance(value, jax.Array) or not isinstance(value, numbers.Real):
                 continue  # traced or symbolic: checked where the number was given
             try:
                 number = float(value)
