@@ -30,7 +30,7 @@ RUBBING = JOINT + fx.Coulomb("hub", 0.03) + fx.CubicSpring("joint", 4.0)
 LOADED = JOINT + fx.LoadFriction("hub", level=0.01, driving=0.2, driven=0.1, of="motor")
 SERVO = JOINT.without("motor", "hub") + fx.PidServo("hub", torque_constant=0.3, resistance=3.0, integral=4.0)
 CASES = {
-    "a second contact": (RUBBING, Exponential(), fx.Stribeck("joint", 0.0, 0.0, 0.4)),
+    "a second contact": (RUBBING, Exponential(passes=2), fx.Stribeck("joint", 0.0, 0.0, 0.4)),
     "the same contact": (RUBBING, Exponential(passes=2), fx.CoulombAsymmetric("hub", 0.0, 0.0)),
     "a torque, order 4": (RUBBING, Exponential(order=4), fx.Gravity("arm", 0.0, 0.0)),
     "a memory": (RUBBING, Exponential(), fx.LuGre("joint", level=0.0, damping=0.0)),
