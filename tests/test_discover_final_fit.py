@@ -208,6 +208,22 @@ def test_of_two_calibrations_one_may_be_carried_over(monkeypatch):
     assert "alpha.sensor_bias.bias" not in found.final_fit.to_dict()["parameters"]
 
 
+def test_an_offset_is_carried_over_where_validation_data_are_better_with_it(monkeypatch):
+    """Errors are 1 without offsets, 0.9 with the first, 0.95 with two, 0.8 with the first and the last."""
+    errors = {"": 1.0, "a": 0.9, "ab": 0.95, "ac": 0.8}
+
+    def carrying(on: str) -> SimpleNamespace:
+        return SimpleNamespace(on=on, own=("a", "b", "c"), carrying=lambda location: carrying(on + location))
+
+    def errors_of(validation, each, on):
+        return RunErrors({}, {"theta": errors[on]})
+
+    monkeypatch.setattr(MODULE, "errors_as_trained", errors_of)
+    tried: Any = SimpleNamespace(fits=(), structure=carrying(""))
+    evaluation: Any = SimpleNamespace(validation=None)
+    assert MODULE._with_offsets_that_help(tried, evaluation).on == "ac"
+
+
 @pytest.mark.parametrize("kept_for", ["its use", "validation data", ""])
 def test_an_offset_of_the_one_run_that_it_hardly_needs_is_left_out(arm, monkeypatch, kept_for):
     """Validation data of the same run are better with the offset, but other runs do not have it.
