@@ -281,6 +281,14 @@ def test_least_squares_finds_them_under_a_coloured_input_and_a_short_memory() ->
     assert np.max(np.abs(without.h1 - kernels.h1)) > 10 * np.max(kernels.errors[0])
 
 
+def test_kernels_are_about_the_mean_of_the_input() -> None:
+    u = 2.0 + white(16)[:4000]
+    found = average_kernels(paper(), u, "alpha", MEMORY, Ts=Ts)
+    assert found.about == pytest.approx(np.mean(u))
+    assert found.covariance is not None and found.covariance[0, 0] == pytest.approx(1.0, abs=0.1)
+    assert average_kernels(paper(), u, "alpha", MEMORY, Ts=Ts, mirrored=True).about == 0.0
+
+
 def test_an_input_that_is_not_gaussian_is_told_with_its_kurtosis() -> None:
     """Uniform numbers have the excess kurtosis -1.2."""
     rng = np.random.default_rng(15)

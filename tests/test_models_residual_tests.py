@@ -15,6 +15,7 @@ from rotflex_jax.errors import InputError
 from rotflex_jax.models.comparison import default_labels
 from rotflex_jax.models.model import Model
 from rotflex_jax.models.residual_tests import frequency_response, residual_tests
+from rotflex_jax.report import simulation
 from rotflex_jax.report.figures import pictures
 from rotflex_jax.report.page import render
 
@@ -229,3 +230,14 @@ def test_a_steady_drift_changes_no_frequency_response() -> None:
     steady, drifting = frequency_response(u, y, 0.01), frequency_response(u, y + drift, 0.01)
     np.testing.assert_allclose(drifting.response, steady.response, rtol=1e-6)
     np.testing.assert_allclose(drifting.coherence, steady.coherence, rtol=1e-6)
+
+
+def test_errors_on_the_page_of_a_simulation_are_in_the_unit_of_its_rows(recording, monkeypatch) -> None:
+    """Errors of 0.01 rad (0.573 deg) at each sample and of 0.03 rad (1.72 deg) at one."""
+    for drawn in ("_run_pictures", "_test_pictures"):
+        monkeypatch.setattr(simulation, drawn, lambda made: [])
+    off = np.full(recording.y.shape, 0.01)
+    off[recording.n_init + 5] = 0.03
+    made = simulation.tested(recording, Model(rf.joints.paper()), recording.y - off)
+    first, second = simulation._content(made)["rows"]
+    assert (first[0], first[1], first[2]) == ("theta [deg]", "0.574", "1.72") and second[2] == "1.72"
