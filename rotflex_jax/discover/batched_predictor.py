@@ -96,11 +96,11 @@ def _slopes(
     samples: ProgramSamples,
 ) -> tuple[jax.Array, jax.Array]:
     x0 = whole_state(structure, parameter_set.x0)
-    x0_ways = jnp.pad(directions.x0, ((0, 0), (0, x0.shape[-1] - parameter_set.x0.shape[-1])))
+    x0_tangents = jnp.pad(directions.x0, ((0, 0), (0, x0.shape[-1] - parameter_set.x0.shape[-1])))
 
     def one(values: Any, x0: Any, K: Any, dvalues: Any, given: ProgramSamples) -> tuple[jax.Array, jax.Array]:
         parameters = RunParameters(values, parameter_set.gates, x0, K)
-        tangents = TangentDirections(dvalues, directions.gates, x0_ways)
+        tangents = TangentDirections(dvalues, directions.gates, x0_tangents)
 
         def place(sums: Any, y_hat: jax.Array, J: jax.Array, sample: Any) -> Any:
             (k, e, slopes), (y, seen) = sums, sample
@@ -109,11 +109,11 @@ def _slopes(
             put = jax.lax.dynamic_update_slice_in_dim
             return (k + 1, put(e, here[None], k, 0), put(slopes, J[:, None], k, 1)), None
 
-        none = jnp.zeros((len(x0_ways), *given.data.y.shape), given.data.y.dtype)
+        none = jnp.zeros((len(x0_tangents), *given.data.y.shape), given.data.y.dtype)
         run = RecordingSamples(*given.data, given.window, given.count)
-        return accumulate_outputs(structure, solver, parameters, tangents, run, place, (0, none[0], none))[0][
-            1:
-        ]
+        start = (0, none[0], none)
+        sums, _ = accumulate_outputs(structure, solver, parameters, tangents, run, place, start)
+        return sums[1:]
 
     rows = (parameter_set.values, x0, parameter_set.K, jnp.swapaxes(directions.values, 0, 1), samples)
     if len(x0) == 1:

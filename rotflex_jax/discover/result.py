@@ -434,7 +434,7 @@ class Ranked:
         score: Penalised score [nat]; negative where the data are evidence against it.
         excited: False where this recording could not have shown an effect of a plausible size.
         orthogonal_fraction: Share of its trace in the outputs that the baseline cannot imitate, 0 to 1.
-        detection_limit: Detection limit: factor of a plausible size that would just have been visible.
+        detection_limit: Factor of a plausible size that would just have been visible.
         score_free_run: Penalised score in free runs over some seconds [nat]; None where it was not computed.
     """
 

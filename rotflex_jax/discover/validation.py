@@ -69,9 +69,11 @@ class ShortRuns:
     def _first_states(self, run: ParameterSet, directions: int) -> Float[np.ndarray, "R W m"]:
         """First states whose positions and speeds are fitted to the first samples of each window."""
         size, (R, P) = self.windows.first_states.shape[-1], run.values.shape
-        x0_ways = np.eye(directions, run.x0.shape[-1])
-        x0_ways[size:] = 0.0
-        tangents = Directions(np.zeros((directions, R, P)), x0_ways, np.zeros((directions, len(run.gates))))
+        x0_tangents = np.eye(directions, run.x0.shape[-1])
+        x0_tangents[size:] = 0.0
+        tangents = Directions(
+            np.zeros((directions, R, P)), x0_tangents, np.zeros((directions, len(run.gates)))
+        )
 
         def started_at(points: list[_FirstState]) -> ParameterSet:
             x0 = run.x0.copy()
@@ -85,9 +87,8 @@ class ShortRuns:
                 return [NormalEquations.of(slopes.reshape(size, -1).T, w.ravel()) for slopes, w in heads]
 
             # One run over each recording serves all of its windows.
-            return self.predictor.of_slopes(equations, [started_at(points)], [tangents], self.windows.index)[
-                0
-            ]
+            index = self.windows.index
+            return self.predictor.of_slopes(equations, [started_at(points)], [tangents], index)[0]
 
         found = minimise_together(
             linearise,
