@@ -154,8 +154,8 @@ def test_a_second_call_repeats_only_what_has_changed(files, serial, tmp_path) ->
 @pytest.mark.parametrize(
     "change",
     [
-        {"joint": rf.joints.paper(stiffness=2.0)},
-        {"joint": JOINT + rf.effects.Coulomb(at="hub")},
+        {"mechanism": rf.joints.paper(stiffness=2.0)},
+        {"mechanism": JOINT + rf.effects.Coulomb(at="hub")},
         {"split": 0.5},
         {"degrees": True},
         {"search": functools.partial(batch_search.quick, hold="more")},
@@ -163,7 +163,7 @@ def test_a_second_call_repeats_only_what_has_changed(files, serial, tmp_path) ->
     ids=lambda change: "".join(change),
 )
 def test_other_questions_are_not_answered_from_disk(change, files, tmp_path) -> None:
-    asked = {"joint": JOINT, "search": batch_search.quick, "accept": ("units",)}
+    asked = {"mechanism": JOINT, "search": batch_search.quick, "accept": ("units",)}
     one = functools.partial(fleet, recordings=files[:1], folder=tmp_path / "out", workers=0)
     assert not one(**asked).rows[0].known
     assert one(**asked).rows[0].known
