@@ -63,11 +63,11 @@ def directions(only: list[str]) -> tuple[list[tuple[str, str]], dict[str, str]]:
         if only and not chosen:
             continue
         try:
-            directions = [d.name for d in machine.directions()]
+            names = [direction.name for direction in machine.directions()]
         except (rf.InputError, OSError) as problem:
             left_out[name] = str(problem)
             continue
-        wanted += [(name, w) for w in directions if not only or name in chosen or f"{name}: {w}" in chosen]
+        wanted += [(name, d) for d in names if not only or name in chosen or f"{name}: {d}" in chosen]
     return wanted, left_out
 
 

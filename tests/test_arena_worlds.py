@@ -177,8 +177,7 @@ def test_a_row_of_worlds_hides_every_effect():
 
 @pytest.mark.parametrize("seed", [404, 405])
 def test_a_world_is_three_runs_of_one_machine_and_always_the_same(seed):
-    w = world(seed)
-    again = world(seed) if seed == 405 else w  # one generator draws both kinds
+    w, again = world(seed), world(seed)
     assert w.kind == ("link" if seed == 405 else "joint")
     runs = (w.train, w.validation, w.test)
     for a, b in zip(runs, (again.train, again.validation, again.test), strict=True):

@@ -83,10 +83,8 @@ def test_every_measured_machine_has_its_place():
 def test_what_judges_was_not_learnt_from():
     """Test data of the measured machines do not overlap with training and validation data."""
     record = drifting(0.0)
-    direction = halves(record)
-    assert (
-        sum(r.N for part in (direction.train, direction.validation, direction.test) for r in part) == record.N
-    )
+    half = halves(record)
+    assert sum(r.N for part in (half.train, half.validation, half.test) for r in part) == record.N
     for machine in MACHINES.values():
         try:
             directions = machine.directions()

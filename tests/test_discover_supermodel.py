@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiler_options import ROUGH
 
 import rotflex_jax.effects as fx
 from rotflex_jax.discover.batched_predictor import BatchedPredictor, Directions, ParameterSet
@@ -106,9 +107,7 @@ def program(between: str):
         at = (whole.values, whole.gates)
         return e(*at), jax.vmap(lambda dv, dg: jax.jvp(e, at, (dv, dg))[1])(dvalues, dgates)
 
-    # It runs a few times only, so that optimisation by the compiler does not pay.
-    rough = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
-    return jax.jit(run, compiler_options=rough)
+    return jax.jit(run, compiler_options=ROUGH)
 
 
 def whole_run(whole: ParameterSet, along: Directions, between: str = "held") -> tuple[np.ndarray, np.ndarray]:

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiler_options import ROUGH
 from scipy.integrate import solve_ivp
 
 import rotflex_jax as rf
@@ -19,7 +20,6 @@ from rotflex_jax.recording import Recording
 from rotflex_jax.runtime.xla import double_precision
 
 TS, FINE = 0.005, 100
-ROUGH = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
 PARTS = {"derivative": 0.012, "dead_band": 0.01, "source_resistance": 0.8}
 INTEGRAL, WINDUP, TAU, SINE, LIMIT = 3.0, 30.0, 0.02, 0.48, 0.55
 

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiler_options import ROUGH
 from scipy.integrate import solve_ivp
 from scipy.signal import cont2discrete
 
@@ -139,9 +140,7 @@ def test_slopes_equal_central_differences(solver):
         P = len(values)
         ways = TangentDirections(jnp.eye(P), jnp.zeros((P, len(m.effects))), jnp.zeros((P, 4)))
         samples = RecordingSamples(jnp.asarray(w), jnp.zeros((120, 2)), jnp.ones(120), jnp.asarray(TS))
-        # The program runs once, so optimising it takes longer than it saves.
-        rough = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
-        slopes = jax.jit(outputs_with_sensitivities, static_argnums=(0, 1), compiler_options=rough)
+        slopes = jax.jit(outputs_with_sensitivities, static_argnums=(0, 1), compiler_options=ROUGH)
         y, J = slopes(structure, solver, parameters, ways, samples)
     np.testing.assert_allclose(y, run(values), atol=1e-12)
     for name in m.free_names:

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiler_options import ROUGH
 from scipy.integrate import solve_ivp
 
 import rotflex_jax as rf
@@ -229,11 +230,9 @@ def test_slopes_are_those_of_central_differences():
     structure, values = machine.structure, machine.values
     with double_precision():
         rest = [jnp.ones(len(machine.effects)), jnp.zeros(6), jnp.asarray(u), jnp.asarray(Ts)]
-        # Each program runs only a few times, so its optimisation would take longer than it saves.
-        rough = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
         of_values = lambda v: free_run(structure, Exponential(), v, *rest)[1]  # noqa: E731
-        run = jax.jit(of_values, compiler_options=rough)
-        slope = jax.jit(lambda v, d: jax.jvp(of_values, (v,), (d,))[1], compiler_options=rough)
+        run = jax.jit(of_values, compiler_options=ROUGH)
+        slope = jax.jit(lambda v, d: jax.jvp(of_values, (v,), (d,))[1], compiler_options=ROUGH)
         for i, name in enumerate(machine.parameter_names):
             way = np.zeros(len(values))
             way[i] = values[i]

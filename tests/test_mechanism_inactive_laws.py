@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiler_options import ROUGH
 
 import rotflex_jax.effects as fx
 from rotflex_jax.joints import paper
@@ -23,8 +24,6 @@ from rotflex_jax.mechanism.simulate import PredictorStep, prepared_run, read_out
 from rotflex_jax.runtime.xla import double_precision
 
 Ts, N = 0.004, 150
-# Each program runs once, so optimising it takes longer than it saves.
-ROUGH = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
 JOINT = paper(joint_damping=1e-3)
 RUBBING = JOINT + fx.Coulomb("hub", 0.03) + fx.CubicSpring("joint", 4.0)
 LOADED = JOINT + fx.LoadFriction("hub", level=0.01, driving=0.2, driven=0.1, of="motor")

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiler_options import ROUGH
 
 import rotflex_jax.effects as fx
 from rotflex_jax.joints import paper
@@ -36,8 +37,6 @@ from rotflex_jax.runtime.xla import double_precision, loops_are_fast
 
 Ts, N = 0.004, 150
 SOLVER = Exponential(passes=2)
-# Each program runs once, so optimising it takes longer than it saves.
-ROUGH = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
 
 BASELINES = {
     # Absent effects have states on both sides of the memory, and behind the motor current.

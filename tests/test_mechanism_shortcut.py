@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiler_options import ROUGH
 
 from rotflex_jax import effects as fx
 from rotflex_jax.joints import paper
@@ -14,8 +15,6 @@ from rotflex_jax.mechanism.simulate import FreeStep, prepared_run
 from rotflex_jax.runtime.xla import double_precision
 
 Ts, N = 0.002, 1500
-# Each program runs once, so optimising it takes longer than it saves.
-ROUGH = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
 JOINT = paper(stiffness=1.5)
 CASES = {
     "one contact": JOINT + fx.Coulomb("hub", level=0.02),

@@ -554,7 +554,11 @@ BAD: dict[tuple[str, str], list[tuple[Any, str]]] = {
         (-1, "from -1"),
     ],
     ("Model.simulate", "recording"): NO_RECORDINGS,
-    ("Model.simulate", "x0"): [(np.zeros(9), "9 entries"), ([NAN], "in a row"), ("a", "`x0` must be")],
+    ("Model.simulate", "x0"): [
+        (np.zeros(9), "9 entries"),
+        ([NAN], "must be numbers, finite and in a row"),
+        ("a", "`x0` must be numbers"),
+    ],
     ("Model.simulate_states", "recording"): NO_RECORDINGS[:3],
     ("Model.simulate_windows", "recording"): NO_RECORDINGS[:3],
     ("Model.behind_actuation", "recording"): NO_RECORDINGS[:3],

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiler_options import ROUGH
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 from sticking import ARM, HUB, JOINT, Joint, asymmetric, coulomb, stribeck
@@ -574,8 +575,6 @@ LADEN = {
     ],
     "loaded motor": [fx.GearFriction("hub", 0.01, 0.2), fx.TorqueSaturation("hub", 0.5)],
 }
-# Each program runs only a few times, so its optimisation would take longer than it saves.
-ROUGH = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
 # Cases with derivatives in reverse mode too, which is slow to compile; `memory` has dry friction.
 BACKWARD = {"smooth", "memory"}
 

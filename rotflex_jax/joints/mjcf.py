@@ -380,30 +380,16 @@ class _Reader:
         file = self.file
         if kind == "position":
             stiffness = file.number(attributes, "kp", 1.0)
-            return (
-                stiffness,
-                0.0,
-                -stiffness,
-                -file.number(attributes, "kv"),
-                file.number(attributes, "timeconst"),
-            )
+            damping, time = file.number(attributes, "kv"), file.number(attributes, "timeconst")
+            return stiffness, 0.0, -stiffness, -damping, time
         if kind == "velocity":
             return file.number(attributes, "kv", 1.0), 0.0, 0.0, -file.number(attributes, "kv", 1.0), 0.0
         if kind == "motor":
             return 1.0, 0.0, 0.0, 0.0, 0.0
-        dynamics, gains = (
-            attributes.get("dyntype", "none"),
-            file.numbers(attributes, "gainprm", None, np.ones(1)),
-        )
-        if attributes.get("gaintype", "fixed") != "fixed" or dynamics not in (
-            "none",
-            "filter",
-            "filterexact",
-        ):
-            self.unable(
-                f"an actuator of gaintype {attributes.get('gaintype', 'fixed')}, dyntype {dynamics}",
-                "actuator law",
-            )
+        gains = file.numbers(attributes, "gainprm", None, np.ones(1))
+        kind_of_gain, dynamics = attributes.get("gaintype", "fixed"), attributes.get("dyntype", "none")
+        if kind_of_gain != "fixed" or dynamics not in ("none", "filter", "filterexact"):
+            self.unable(f"an actuator of gaintype {kind_of_gain}, dyntype {dynamics}", "actuator law")
         bias = np.zeros(3)
         if attributes.get("biastype", "none") == "affine":
             given = file.numbers(attributes, "biasprm", None, np.zeros(3))[:3]
