@@ -97,6 +97,16 @@ def test_the_smoother_is_that_of_rauch_tung_and_striebel():
         assert float(log_likelihood(*arrays)) == pytest.approx(total, rel=1e-10)
 
 
+def test_likelihoods_of_several_sets_are_those_of_each():
+    """The intensities of a set are in a column."""
+    model, start, noise, Q = time_varying_model()
+    sets = np.stack([Q, 3 * Q, Q + 0.1], axis=1)
+    expected = [textbook(model, start, noise, each)[2] for each in sets.T]
+    with double_precision():
+        found = log_likelihood(*jax.tree.map(jnp.asarray, (model, start, noise, sets)))
+    np.testing.assert_allclose(np.asarray(found), expected, rtol=1e-10)
+
+
 def test_a_torque_that_no_sample_shows_is_as_uncertain_at_the_first_sample_as_at_any_other():
     """The variance of an Ornstein-Uhlenbeck process of intensity q and time constant T is q T / 2."""
     T, q, N = 3.0, 2.0, 30
@@ -312,9 +322,9 @@ def test_two_recordings_are_one_after_the_other():
 def test_other_parameters_need_no_compilation():
     r, _ = recorded(seconds=2.0)
     latent_torque(paper(**TRUE), r)
-    counts = len(linearise_along), smoother._log_likelihoods._cache_size()
+    counts = len(linearise_along), len(smoother._log_likelihoods)
     latent_torque(paper(hub_damping=0.01, joint_damping=0.004), r)
-    assert (len(linearise_along), smoother._log_likelihoods._cache_size()) == counts
+    assert (len(linearise_along), len(smoother._log_likelihoods)) == counts
 
 
 def test_torques_of_the_model_itself_and_the_spectrum_of_the_longest_recording():

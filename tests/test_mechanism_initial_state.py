@@ -1,7 +1,9 @@
 """The first state comes from the first samples, and a free run uses no other measured output."""
 
 import dataclasses
+import re
 
+import jax
 import numpy as np
 import pytest
 
@@ -98,6 +100,17 @@ def test_other_numbers_of_stretches_compile_nothing_and_change_none(truth):
         np.testing.assert_allclose(alone, found[pick], rtol=0, atol=1e-7)
     np.testing.assert_allclose(few, found[:3], rtol=0, atol=1e-7)
     assert len(_fitted_states) == held
+
+
+def test_samples_of_another_shape_compile_nothing_but_the_program_that_uses_them(truth, caplog):
+    """`jnp.asarray` would compile a program for each shape that it has not seen."""
+    r, mechanism = truth
+    gates = np.ones(len(mechanism.effects))
+    u, y = stretches(r, "y", STARTS, 43)
+    with jax.log_compiles():
+        initial_states(mechanism, Exponential(), gates, u, y, r["Ts"])
+    names = re.findall(r"Finished XLA compilation of (\S+)", caplog.text)
+    assert set(names) <= {"jit(flat)"}
 
 
 def test_encoder_noise_is_averaged(truth):

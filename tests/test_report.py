@@ -53,6 +53,7 @@ from rotflex_jax.report.figures.evidence import parameters, staircase
 from rotflex_jax.report.figures.failure import _maps, profiles, worst_channel
 from rotflex_jax.report.figures.residuals import residual_figure, response_figure
 from rotflex_jax.report.page import render
+from rotflex_jax.text.plotting import blank, data_address
 
 NASTY = "bench <script>alert(1)</script> & 'co'.csv"
 NOISE = 5e-4
@@ -533,6 +534,18 @@ def test_figures_leave_the_settings_of_matplotlib_alone(discovery) -> None:
     pictures(discovery)
     assert dict(matplotlib.rcParams) == before
     assert "matplotlib.pyplot" not in sys.modules or not sys.modules["matplotlib.pyplot"].get_fignums()
+
+
+def test_a_figure_of_a_page_is_arranged_and_stays_as_it_is() -> None:
+    """Long labels make room for themselves, and the figure can still be shown in another size."""
+    figure = blank(6.0, 2.0)
+    for axes in figure.subplots(1, 2):
+        axes.set_ylabel("deflection\nof the arm [deg]")
+    layout = figure.get_layout_engine()
+    data_address(figure)
+    left, right = (axes.get_tightbbox() for axes in figure.axes)
+    assert left is not None and right is not None and left.x0 > 0 and left.x1 < right.x0
+    assert figure.get_layout_engine() is layout
 
 
 def test_degrees_are_drawn_where_angles_are_read(discovery) -> None:

@@ -6,7 +6,6 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -351,7 +350,7 @@ class GreyBoxProblem:
         R = len(self.dataset.recordings)
         calls = [slice(0, R)] if self.layout.mesh else [slice(r, r + 1) for r in range(R)]
         data = self.dataset.data
-        return [(rows, StackedRecordings(*(jnp.asarray(part[rows]) for part in data))) for rows in calls]
+        return [(rows, jax.device_put(StackedRecordings(*(part[rows] for part in data)))) for rows in calls]
 
     def _run_inputs(
         self, point: FitPoint, stage: FitStage, K: Float[np.ndarray, "R n C"]

@@ -368,19 +368,16 @@ def _stage(
     size = mesh.size if mesh else 1
     together = size * min(STARTS_PER_CALL, -(-len(z) // size))
     with double_precision():
-        data = stack(recordings, model)
-        arrays = type(data)(*(jnp.asarray(part) for part in data))
-        inputs = SharedInputs(
-            jnp.asarray(model.mechanism.values), jnp.asarray(free), arrays, jnp.asarray(noise)
-        )
+        shared = model.mechanism.values, free, stack(recordings, model), noise
+        inputs = SharedInputs(*jax.device_put(shared))
         for at in range(0, len(z), together):
             pick = np.minimum(np.arange(at, at + together), len(z) - 1)
             found = minimise_starts(
                 model.mechanism.structure,
                 model.solver,
                 mesh,
-                jnp.asarray(z[pick]),
-                jnp.asarray(x0[pick]),
+                jax.device_put(z[pick]),
+                jax.device_put(x0[pick]),
                 inputs,
                 max_steps,
                 tolerance,

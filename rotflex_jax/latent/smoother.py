@@ -24,6 +24,7 @@ from rotflex_jax.mechanism import Mechanism, Solver, predictor_run
 from rotflex_jax.mechanism.assembly import motor_inputs
 from rotflex_jax.mechanism.scan import state_jacobians
 from rotflex_jax.mechanism.simulate import read_outputs
+from rotflex_jax.mechanism.small_matrices import expand_axes
 from rotflex_jax.parameters import parameter
 from rotflex_jax.runtime.persistent_jit import persistent_jit
 
@@ -62,12 +63,12 @@ class _ChannelUpdate(NamedTuple):
 
 
 def _product(A: jax.Array, B: jax.Array) -> jax.Array:
-    """`A @ B` as a sum of products, which the compiler fuses into the loop."""
-    return jnp.sum(A[:, :, None] * B[None], axis=1)
+    """`A @ B` as a sum of products, which the compiler fuses into the loop. `B` may have more axes behind."""
+    return jnp.sum(expand_axes(A[:, :, None], B[None]) * B[None], axis=1)
 
 
 def _times(A: jax.Array, x: jax.Array) -> jax.Array:
-    return jnp.sum(A * x[None], axis=1)
+    return jnp.sum(expand_axes(A, x[None]) * x[None], axis=1)
 
 
 def _measurement_update(
@@ -76,32 +77,35 @@ def _measurement_update(
     """Mean and covariance after the update with the channels of one sample."""
     updates = []
     for c in range(H.shape[0]):
-        h, r = H[c], noise[c] ** 2
-        Ph = _times(P, h)
-        S = jnp.sum(h * Ph) + r
-        K = seen * Ph / S
-        e = y[c] - jnp.sum(h * m)
-        m = m + K * e
+        h, r = expand_axes(H[c], m), noise[c] ** 2
+        Ph = jnp.sum(P * h[None], axis=1)
+        S = jnp.sum(h * Ph, axis=0) + r
+        K = seen * Ph / S[None]
+        e = y[c] - jnp.sum(h * m, axis=0)
+        m = m + K * e[None]
         half = P - K[:, None] * Ph[None]
-        P = half - _times(half, h)[:, None] * K[None] + r * K[:, None] * K[None]
+        P = half - jnp.sum(half * h[None], axis=1)[:, None] * K[None] + r * K[:, None] * K[None]
         updates.append(_ChannelUpdate(K, e, S))
-    return m, (P + P.T) / 2, updates
+    return m, (P + jnp.swapaxes(P, 0, 1)) / 2, updates
 
 
 def _time_update(
     m: jax.Array, P: jax.Array, A: jax.Array, c: jax.Array, Q: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    P = _product(_product(A, P), A.T)
-    return _times(A, m) + c, (P + P.T) / 2 + jnp.diag(Q)
+    P = _product(A, jnp.swapaxes(_product(A, P), 0, 1))
+    added = expand_axes(jnp.eye(len(Q), dtype=Q.dtype), Q[None]) * Q[None]
+    return _times(A, m) + expand_axes(c, m), (P + jnp.swapaxes(P, 0, 1)) / 2 + added
 
 
 def log_likelihood(
     model: LinearTimeVaryingModel,
     start: InitialDistribution,
     noise: Float[Array, " C"],
-    Q: Float[Array, " m"],
-) -> Float[Array, ""]:
-    """Log-likelihood of one recording [nat].
+    Q: Float[Array, "m *sets"],
+) -> Float[Array, "*sets"]:
+    """Log-likelihood of one recording [nat], for one or several sets of intensities of the process noise.
+
+    The sets are the last axes, which vector units process together.
 
     Args:
         model: Linear model along the recording.
@@ -116,7 +120,12 @@ def log_likelihood(
         density = sum(jnp.log(2 * jnp.pi * u.S) + u.e**2 / u.S for u in updates)
         return (*_time_update(m, P, row.A, row.c, Q), total - 0.5 * row.seen * density), None
 
-    first = (start.mean, jnp.diag(start.variance), jnp.zeros((), start.mean.dtype))
+    P = expand_axes(jnp.diag(start.variance), Q[None])
+    first = (
+        jnp.broadcast_to(expand_axes(start.mean, Q), Q.shape),
+        jnp.broadcast_to(P, (len(Q), *Q.shape)),
+        jnp.zeros(Q.shape[1:], Q.dtype),
+    )
     return jax.lax.scan(step, first, model)[0][2]
 
 
@@ -158,8 +167,28 @@ def fixed_interval_smoother(
 # The search ends when changes of the intensities by this factor no longer increase the likelihood.
 LATTICE_TOLERANCE = 1.2
 
-_log_likelihoods = jax.jit(jax.vmap(jax.vmap(log_likelihood, (0, 0, None, 0)), (None, None, None, 0)))
-_smooth_recordings = jax.jit(jax.vmap(fixed_interval_smoother, (0, 0, None, 0)))
+
+@persistent_jit(static=0)
+def _log_likelihoods(
+    model: LinearTimeVaryingModel,
+    start: InitialDistribution,
+    noise: Float[Array, " C"],
+    Q: Float[Array, "L R m"],
+) -> Float[Array, "L R"]:
+    """`log_likelihood` of each recording for each set of intensities."""
+    one = lambda model, start, Q: log_likelihood(model, start, noise, Q.T)  # noqa: E731
+    return jax.vmap(one, (0, 0, 1), 1)(model, start, Q)
+
+
+@persistent_jit(static=0)
+def _smooth_recordings(
+    model: LinearTimeVaryingModel,
+    start: InitialDistribution,
+    noise: Float[Array, " C"],
+    Q: Float[Array, "R m"],
+) -> tuple[Float[Array, "R N m"], Float[Array, "R N m"]]:
+    """`fixed_interval_smoother` of each recording."""
+    return jax.vmap(fixed_interval_smoother, (0, 0, None, 0))(model, start, noise, Q)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -190,14 +219,14 @@ class IntensityEstimator:
         """Log-likelihoods of several sets of intensities [nat]."""
         # The torque at the first sample is as uncertain as at any other. All sets use the largest variance.
         first = self._with_torque_variance(start, levels.max(axis=0))
-        Q = jnp.asarray(self._process_noise(levels))
-        return np.asarray(_log_likelihoods(model, first, jnp.asarray(self.noise), Q)).sum(axis=1)
+        noise, Q = jax.device_put((self.noise, self._process_noise(levels)))
+        return np.asarray(_log_likelihoods(model, first, noise, Q)).sum(axis=1)
 
     def smooth(
         self, model: LinearTimeVaryingModel, start: InitialDistribution, level: Float[np.ndarray, " D"]
     ) -> tuple[Float[np.ndarray, "R N m"], Float[np.ndarray, "R N m"]]:
         """Means and standard deviations of the states, given all samples."""
-        Q, noise = jnp.asarray(self._process_noise(level)), jnp.asarray(self.noise)
+        noise, Q = jax.device_put((self.noise, self._process_noise(level)))
         mean, variance = _smooth_recordings(model, self._with_torque_variance(start, level), noise, Q)
         return np.asarray(mean), np.sqrt(np.asarray(variance))
 
@@ -245,7 +274,7 @@ class IntensityEstimator:
     ) -> InitialDistribution:
         variance = np.array(start.variance)
         variance[:, self.states :] = level * self.time_constant / 2
-        return InitialDistribution(jnp.asarray(start.mean), jnp.asarray(variance))
+        return jax.device_put(InitialDistribution(start.mean, variance))
 
     def _lattice(self) -> np.ndarray:
         """Exponents (L, D) of neighbours on the lattice; for more than two torques, one axis at a time."""

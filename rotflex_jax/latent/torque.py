@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from rotflex_jax import checks
@@ -86,7 +85,7 @@ def latent_torque(
     step = AugmentedStep(augmented.structure, model.solver, len(chosen))
     switches = np.r_[model._switches(), np.ones(len(chosen))]
     with double_precision():
-        values, gates, arrays = jax.tree.map(jnp.asarray, (augmented.values, switches, data))
+        values, gates, arrays = jax.device_put((augmented.values, switches, data))
         S = _predicted_trajectory(model, augmented, dataset)
         estimator = IntensityEstimator(
             noise=noise,
@@ -102,7 +101,7 @@ def latent_torque(
         intensity = np.full(len(chosen), np.sqrt(estimator.smallest * estimator.largest))
         std, linear, nats = S, None, np.zeros(len(chosen))
         for k in range(MAX_LINEARISATIONS):
-            new = linearise_along(step, values, gates, jnp.asarray(S), arrays, jnp.asarray(decay))
+            new = linearise_along(step, values, gates, jax.device_put(S), arrays, jax.device_put(decay))
             if linear is not None and _same_models(linear, new):
                 break
             linear = new
@@ -139,7 +138,7 @@ def _predicted_trajectory(model: Model, augmented: Mechanism, dataset: Dataset) 
     intensities, gates = [process_noise_ports(m, (0.03 * dataset.torque_scale) ** 2)], model._switches()
     K = np.stack([kalman_gains(m, intensities, dataset.noise, float(Ts), gates)[0] for Ts in dataset.data.Ts])
     switches = np.r_[gates, np.ones(len(augmented.effects) - len(m.effects))]
-    arrays = jax.tree.map(jnp.asarray, (augmented.values, switches, x0, dataset.data, K))
+    arrays = jax.device_put((augmented.values, switches, x0, dataset.data, K))
     return np.asarray(predicted_states(augmented.structure, model.solver, *arrays))
 
 

@@ -136,7 +136,7 @@ def initial_states(
     # Rows beyond the segments are not evaluated; they keep the number of compiled shapes small.
     rows = np.minimum(np.arange(max(LEAST_ROWS, 2 ** (len(u) - 1).bit_length())), len(u) - 1)
     with double_precision():
-        segments = map(jnp.asarray, (guess[rows], hidden[rows], u[rows], y[rows], np.float64(Ts)))
-        parameters = map(jnp.asarray, (mechanism.values, gates))
-        found = np.asarray(_fitted_states(structure, solver, *parameters, *segments, jnp.asarray(len(u))))
+        segments = guess[rows], hidden[rows], u[rows], y[rows], np.float64(Ts)
+        given = jax.device_put((mechanism.values, gates, *segments, len(u)))
+        found = np.asarray(_fitted_states(structure, solver, *given))
     return np.concatenate([found[: len(u)], hidden], axis=1)

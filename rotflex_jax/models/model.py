@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Real
 
@@ -212,7 +211,7 @@ class Model:
 
     def parameters_and_gates(self) -> tuple[Float[Array, " P"], Float[Array, " E"]]:
         """Parameter values and gates, in the precision of the context."""
-        return jnp.asarray(self.mechanism.values), jnp.asarray(self._switches())
+        return jax.device_put((self.mechanism.values, self._switches()))
 
     def _switches(self) -> np.ndarray:
         return np.ones(len(self.mechanism.effects)) if self.gates is None else np.array(self.gates)
@@ -224,7 +223,7 @@ class Model:
             return v, here
         gates, u = self._switches(), recording.u.astype(float)
         with double_precision():
-            given = map(jnp.asarray, (here.mechanism.values, gates, _filled(u), float(recording.Ts)))
+            given = jax.device_put((here.mechanism.values, gates, _filled(u), float(recording.Ts)))
             at_motor = np.asarray(_motor_voltage(self.mechanism.structure, *given))[: len(u)]
         v = at_motor if v.ndim == 1 else np.column_stack([at_motor, v[:, 1:]])
         gates[[i for i, _ in acting]] = 0.0
@@ -265,9 +264,7 @@ class Model:
                 self.mechanism.structure,
                 self.solver,
                 *self.at(recording).parameters_and_gates(),
-                jnp.asarray(start),
-                jnp.asarray(_filled(self.inputs(recording))),
-                jnp.asarray(float(recording.Ts)),
+                *jax.device_put((start, _filled(self.inputs(recording)), float(recording.Ts))),
             )
             return np.asarray(run[0])[: recording.N], np.asarray(run[1])[: recording.N]
 
@@ -319,9 +316,7 @@ class Model:
                 inner.mechanism.structure,
                 inner.solver,
                 *inner.parameters_and_gates(),
-                jnp.asarray(x0),
-                jnp.asarray(u[inside]),
-                jnp.asarray(float(recording.Ts)),
+                *jax.device_put((x0, u[inside], float(recording.Ts))),
             )
             answers = np.asarray(run[1])[: len(starts)]
         out = np.empty_like(y)
@@ -391,9 +386,7 @@ class Model:
                 self.mechanism.structure,
                 self.solver,
                 *here.parameters_and_gates(),
-                jnp.asarray(x0),
-                *map(jnp.asarray, (u, y, np.ones(len(u)), K)),
-                jnp.asarray(float(recording.Ts)),
+                *jax.device_put((x0, u, y, np.ones(len(u)), K, float(recording.Ts))),
             )
             return np.asarray(run[1])
 

@@ -128,9 +128,13 @@ _SIGNS = str.maketrans({",": "\u202f", "-": "−"})
 
 def data_address(figure: Figure) -> str:
     """The figure as an SVG image in a data URL, so that a page needs no other file."""
-    buffer = io.StringIO()
+    buffer, layout = io.StringIO(), figure.get_layout_engine()
     with matplotlib.rc_context(_STYLE):
+        if layout:  # otherwise `savefig` draws everything once more, only to arrange it
+            layout.execute(figure)
+            figure.set_layout_engine(None)
         figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
+        figure.set_layout_engine(layout)
     svg = _UNUSED.sub("", buffer.getvalue())
     svg = _COORDINATES.sub(lambda found: _LONG_NUMBER.sub(_rounded, found[0]), svg)
     # Percent encoding is a third smaller than base 64; pages should be small enough for e-mail.
