@@ -10,8 +10,8 @@
 # # Which effect is my model missing?
 #
 # You have a recording of a rotary flexible joint and a textbook model that does not quite follow
-# it. This notebook walks the loop by hand once: compare, see where the model fails, add an effect,
-# watch the error fall. At the end `rf.discover` does the same in one call.
+# it. This notebook makes each step by hand once: compare, see where the model fails, add an effect,
+# compare again. At the end `rf.discover` does the same in one call.
 #
 # The recording comes with the package. It is simulated, with two effects hidden in it, so that the
 # answer can be checked. To use your own, replace one line: `rf.load("run.csv")`.
@@ -36,8 +36,8 @@ GREY, RED, AMBER, BLUE = "#9aa5b1", "#c8452f", "#d98e04", "#0f6f86"
 # %% [markdown]
 # ## The data
 #
-# Voltage in; angle of the hub (theta) and deflection of the arm (alpha) out. Models learn from the
-# first 70 % and are evaluated on the rest, which no fit sees.
+# The input is the voltage. The outputs are the angle of the hub (theta) and the deflection of the arm
+# (alpha). Models are fitted to the first 70 % and evaluated on the rest, to which nothing is fitted.
 
 # %%
 recording = rf.data.demo_recording()
@@ -63,7 +63,7 @@ plt.show()
 
 # %% [markdown]
 # Both encoders count in steps. No model can follow such a sensor more closely than its rounding,
-# step / √12: that is the floor for every error below.
+# step / √12: no error below can be smaller than that.
 
 # %%
 rounding = {channel: step / np.sqrt(12) for channel, step in recording.resolution.items()}
@@ -74,8 +74,8 @@ for channel, value in rounding.items():
 # ## Compare
 #
 # `rf.joints.paper()` is the textbook joint: two inertias, a linear spring, a motor, viscous
-# damping. It is fitted, then simulated on the held-out part in free run: it gets the voltage and
-# the first 0.2 s, and nothing else.
+# damping. It is fitted, and then simulated over the held-out part in a free run: it gets the voltage and
+# the first 0.2 s of the angles, and nothing else.
 
 # %%
 textbook = rf.fit(rf.joints.paper(), train)
@@ -101,15 +101,15 @@ def show_run(fit, colour):
 show_run(textbook, RED)
 
 # %% [markdown]
-# It looks right from afar, but the errors are more than ten times the rounding, and they are
+# The curves look alike, but the errors are more than ten times the rounding, and they are
 # smooth: this is not noise.
 #
 # ## Where does it fail?
 #
-# `rf.locate` looks for times, frequencies, speeds, deflections and moments after a reversal that
-# hold more than their share of the error, and keeps what chance does not explain. Look for hints in
-# the training data; the held-out part stays untouched for comparing. Free runs start again every two
-# seconds here, so that old errors do not pile up.
+# `rf.locate` finds times, frequencies, speeds, deflections and moments after a reversal that
+# hold more than their share of the error, and keeps what chance does not explain. It is given the
+# training data here, so that the held-out part is used for the comparison only. Free runs start again
+# every two seconds, so that earlier errors do not accumulate.
 
 
 # %%
@@ -125,9 +125,9 @@ def look(fit):
 first_look = look(textbook)
 
 # %% [markdown]
-# The first lines name the deflection: a large share of the error arises in the little time that
-# the spring spends far from its middle. To see its shape, take what the model *lacks*, the
-# acceleration of its error, and average it over deflection and over hub speed.
+# The first lines name the deflection: a large share of the error arises in the short time in which
+# the spring is far from its middle. To see its shape, average what the model *lacks*, the
+# acceleration of its error, over intervals of the deflection and of the hub speed.
 
 
 # %%
@@ -155,9 +155,9 @@ def show_missing(fit, colour):
 show_missing(textbook, RED)
 
 # %% [markdown]
-# Left: far from its middle the real arm is pulled back harder than the linear spring pulls. The bend the
-# other way in between is the fit's doing: it made the linear spring stiffer to make up for it. Right: a
-# step where the hub changes direction. One thing after the other.
+# Left: far from its middle the real arm is pulled back by more than the torque of the linear spring. In
+# between the curve bends the other way, because the fit has made the linear spring stiffer to compensate.
+# Right: a step where the hub changes direction. The deflection comes first.
 #
 # ## Which effect?
 #
@@ -191,12 +191,13 @@ def show_errors(fits):
 show_errors(fits)
 
 # %% [markdown]
-# - The **cubic spring** takes more than half of the error of alpha away, and little of theta. Two effects
-#   may be missing, then.
-# - The **dead zone** is a warning: it takes more than a third of the *training* error of theta away, and
-#   more than doubles the held-out one. It imitates friction on the data it was fitted to, and only there.
+# - The **cubic spring** removes more than half of the error of alpha, and little of the error of theta. So
+#   two effects may be missing.
+# - The **dead zone** is a warning: it removes more than a third of the *training* error of theta, and
+#   more than doubles the held-out error. It imitates friction on the data to which it was fitted, and only
+#   there.
 #
-# Look and table agree on the spring. Keep it, and look again.
+# Both results point to the spring. Keep it, and look at the errors again.
 
 # %%
 spring = fits["+ cubic spring at joint"]
@@ -204,10 +205,10 @@ second_look = look(spring)
 show_missing(spring, AMBER)
 
 # %% [markdown]
-# The deflection is gone from the list. What is left arises just after the hub reverses, and against
-# the hub speed (right, left is little now) it has the shape of dry friction: it jumps at standstill
-# and opposes the motion. The slope beyond is, once more, a parameter that was bent to help, here the
-# viscous damping. So add Coulomb friction.
+# The deflection is no longer in the list. What is left arises just after the hub reverses. Over the hub
+# speed (right; little is left over the deflection) it has the shape of dry friction: it jumps at standstill
+# and opposes the motion. The slope beyond the jump is again a parameter that the fit has changed to
+# compensate, here the viscous damping. So add Coulomb friction.
 
 # %%
 both = rf.fit(spring.model + rf.effects.Coulomb(at="hub"), train)
@@ -240,16 +241,16 @@ axes[1].legend(loc="upper right")
 plt.show()
 
 # %% [markdown]
-# Nearly: the last error is a little above the rounding of the encoder, and the third look finds no
-# pattern in it. What is left is noise: besides rounding, this encoder jitters a little.
+# Nearly: the last error is a little above the rounding of the encoder, and `rf.locate` finds no
+# pattern in it. What is left is noise: besides rounding, this encoder has a small jitter.
 #
 # ## The same in one call
 #
 # `rf.discover` starts from the textbook model again. It scores all candidates at once, refits the
 # best, decides on the held-out data, and repeats; then it checks that each effect is needed.
-# `progress=print` tells what it is doing. Here it gets a dozen candidates and two rounds, which is soon
-# done. Leave both out and it tries the whole catalogue wherever an effect makes sense, until nothing more
-# is gained, as in [this notebook](06_which_effect.ipynb).
+# `progress=print` shows what it is doing. Here it gets a dozen candidates and two rounds, to keep this
+# notebook short. Without both arguments it tries the whole catalogue wherever an effect makes sense, until
+# nothing more is gained, as in [this notebook](06_which_effect.ipynb).
 
 # %%
 fx = rf.effects
@@ -264,9 +265,9 @@ print(result.verdict)
 print(result)
 
 # %% [markdown]
-# The ranking shows how strongly the data asked for each effect before any was added, in nats (units
-# of log-likelihood: ten are strong evidence). It is a first guess, made without a refit. Laws that
-# contain Coulomb friction as a special case stand beside it; their extra numbers gained nothing.
+# The ranking shows how much likelier the data would be with each effect, before any was added, in nats
+# (units of log-likelihood: ten are strong evidence). It is a first estimate, made without a refit. Laws that
+# contain Coulomb friction as a special case stand beside it; their further parameters gained nothing.
 
 # %%
 figures.ranking(result)
@@ -274,9 +275,9 @@ figures.ranking(result)
 # %% [markdown]
 # ## Is it true?
 #
-# Here it can be checked, since the recording was simulated. The second lesson of missing physics is
-# in the middle column: the textbook fit does not only follow badly, two of its **parameters are far
-# off, and their intervals do not know it**. The fit has put the missing friction into the damping of
+# Here it can be checked, since the recording was simulated. The column of the textbook fit shows the second
+# consequence of missing physics: not only are its errors large, two of its **parameters are far off, and
+# their intervals do not contain the true values**. The fit has put the missing friction into the damping of
 # the hub, and the hardening into the stiffness.
 
 # %%
@@ -317,13 +318,13 @@ print(result.report("rotflex-report").as_posix())
 # %% [markdown]
 # ## What to expect of your own recording
 #
-# - A real machine rarely ends at the noise. `unexplained` is an honest verdict, and its look still
-#   says where to search.
-# - `ambiguous` names effects that your recording cannot tell apart; `not_excited` those it could
-#   not have shown. Another experiment helps, another algorithm does not.
+# - The errors of a real machine rarely end at the noise. The verdict is then `unexplained`, and the report
+#   still shows where the remaining error lies.
+# - `ambiguous` names effects between which your recording cannot decide; `not_excited` names those that it
+#   could not have shown. Another experiment helps, another algorithm does not.
 # - The held-out part has helped to choose the effects, so its errors are not unbiased any more. Where the
-#   error falls tenfold this does not matter; in a close call, record again.
-# - All torques hang on one trusted constant, the arm's inertia here: if it is 10 % off, so are
+#   error falls tenfold this does not matter; where the decision is close, record again.
+# - All torques are relative to one trusted constant, here the arm's inertia: if it is 10 % off, so are
 #   stiffness and friction.
 #
 # The last cell checks what the text says.

@@ -9,10 +9,10 @@
 # %% [markdown]
 # # Did the quadratic model win, or did identification?
 #
-# "Nonlinear Identification of a Rotary Flexible Joint Experiment" drives a flexible joint with noise,
-# adapts a Volterra model of degree 2 by LMS, watches a coefficient rest after 7000 iterations, and
-# finds its answer to a pulse better than that of a linearised model. This notebook does the same on a
-# simulated joint, where the truth is known, and adds the curve that is missing in the paper: a *linear*
+# The paper "Nonlinear Identification of a Rotary Flexible Joint Experiment" drives a flexible joint with
+# noise and adapts a Volterra model of degree 2 by LMS. A coefficient settles after 7000 iterations, and the
+# model's response to a pulse is better than that of a linearised model. This notebook does the same on a
+# simulated joint, where the truth is known, and adds a curve that the paper does not have: a *linear*
 # model identified from the same data.
 #
 # On the command line the same is `rotflex reproduce`; with `--data run.csv` it takes your recording.
@@ -35,8 +35,8 @@ from rotflex_jax.reproduce.plants import SCENARIOS, plant, response
 # %% [markdown]
 # ## What does the paper leave open?
 #
-# Sampling interval, filter, step sizes, friction, dead zone, signs: most of it. Each is a setting that
-# says where its default comes from.
+# Sampling interval, filter, step sizes, friction, dead zone, signs: most of it. Each is a setting here, with
+# the source of its default.
 
 # %%
 print(Counter(row["source"] for row in Settings.table()))
@@ -45,8 +45,8 @@ for row in Settings.table():
         print(f"{row['name']:12} {row['default']!s:8} {row['source']:11} {row['why']}")
 
 # %% [markdown]
-# The simulated joint has the paper's constants, dry friction, a dead zone, and an amplifier that is 0.3 V
-# off (S6). The offset matters: why, is the question of the section after next.
+# The simulated joint has the paper's constants, dry friction, a dead zone, and an amplifier with an offset
+# of 0.3 V (S6). The section on the 7000 iterations shows why the offset matters.
 
 # %%
 settings = Settings()
@@ -63,8 +63,8 @@ drawn["figure_08"].figure
 # %% [markdown]
 # ## Why 0.1 s between samples?
 #
-# The joint remembers a voltage for about 0.4 s. Five samples hold that only if they lie far enough
-# apart; at 1 ms the best linear model of memory 5, by whatever algorithm, is as good as none.
+# The response of the joint to a voltage lasts about 0.4 s. Five samples cover it only if they lie far enough
+# apart; at 1 ms the best linear model of memory 5 explains next to nothing, whatever the algorithm.
 
 # %%
 drawn["span"].figure
@@ -74,7 +74,7 @@ drawn["span"].figure
 #
 # The step size was computed from the filter that makes the input, *before* the run: ln 20 / (7000 ×
 # eigenvalue). So 7000 is a choice. Left: eight runs, their mean, and the mean that theory predicts.
-# Right: the same input to a joint whose friction and dead zone are the same both ways.
+# Right: the same input to a joint whose friction and dead zone are the same in both directions.
 
 # %%
 a = result.adaptation
@@ -83,9 +83,9 @@ print(a.prediction.stability)
 drawn["figure_09"].figure
 
 # %% [markdown]
-# On the right the true value is zero. A joint with symmetric friction is an *odd* machine: turn the voltage
-# round, and the motion turns round. A quadratic kernel answers both voltages alike. Fitted to a record
-# and its mirror image, it vanishes to the last digit, and with an offset it does not:
+# On the right the true value is zero. A joint with symmetric friction is an *odd* machine: if the voltage is
+# negated, the motion is negated. A quadratic kernel gives the same response to both voltages. Fitted to a
+# record and its mirror image, it vanishes to the last digit, and with an offset it does not:
 
 # %%
 basis = Volterra(Delays(settings.memory))
@@ -103,8 +103,8 @@ for name in ("S1", "S6"):
 # %% [markdown]
 # ## How good is the model?
 #
-# Errors are squared, over the variance of the output, on data that no model has learnt from, with frozen
-# weights; beside that on pulses of 2 V either way.
+# Errors are squared errors over the variance of the output, with frozen weights, on data to which no model
+# was fitted, and on pulses of +2 V and -2 V.
 
 # %%
 print(f"{'':20}{'learnt':>8}{'held out':>10}{'+2 V':>8}{'-2 V':>8}")
@@ -112,9 +112,10 @@ for row in result.rows:
     print(f"{row.name:20}{row.size:8}{row.held_out:10.4f}{row.pulses[0]:8.3f}{row.pulses[1]:8.3f}")
 
 # %% [markdown]
-# Against the linearised joint the quadratic model looks very good. Against an identified linear model it
-# gains a tenth of the error. The pulses say it again; at +2 V the offset happens to make up for friction
-# and dead zone, and the linearised joint beats everything, at -2 V it does not.
+# Compared with the linearised joint the quadratic model looks very good. Compared with an identified linear
+# model its error is smaller by a tenth. The pulses show the same. At +2 V the offset happens to compensate
+# for friction and dead zone, and the linearised joint has the smallest error of all; at -2 V it has the
+# largest.
 
 # %%
 drawn["figure_10"].figure
@@ -125,8 +126,8 @@ drawn["figure_11"].figure
 # %% [markdown]
 # ## What does the online error hide?
 #
-# LMS reports the error it makes while its weights move. That can be small when the model is worthless:
-# the same filter, five samples of 1 ms.
+# LMS reports its error while its weights move. This error can be small although the model is of no use. The
+# figure shows it for the same filter with five samples of 1 ms.
 
 # %%
 drawn["trap"].figure
@@ -134,20 +135,21 @@ drawn["trap"].figure
 # %% [markdown]
 # ## Where do the kernels come from?
 #
-# The equations of the simulated joint have kernels too: differentiate the simulator, average over the
-# input. They agree with those from the data, and switching effects off one by one says who makes what.
+# The equations of the simulated joint have kernels too: differentiate the simulator and average over the
+# input. They agree with the kernels from the data. Switching effects off one by one shows which effect makes
+# which part.
 
 # %%
 print(result.kernels)
 drawn["kernels"].figure
 
 # %% [markdown]
-# ## What stays
+# ## Conclusions
 #
-# - The curve of Figure 9 can be had for any number of iterations; it says nothing about the model.
-# - Friction and dead zone, if symmetric, leave nothing for degree 2. Degree 3 gets a part of them.
+# - The curve of Figure 9 can be produced for any number of iterations; it says nothing about the model.
+# - Degree 2 cannot represent symmetric friction and dead zones. Degree 3 represents a part of them.
 # - The advantage over a linearised model is the advantage of identification.
-# - Which physics is missing, a kernel does not say. For that, see the first notebook.
+# - A kernel does not say which physics is missing. For that, see the [first notebook](00_first_look.ipynb).
 #
 # The last cell checks what the text says.
 

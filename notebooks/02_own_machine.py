@@ -9,8 +9,8 @@
 # %% [markdown]
 # # Does this work for my machine, and for an effect of my own?
 #
-# Nothing in the toolkit knows of a flexible joint in particular. This notebook describes another machine
-# in some lines, an effect that the catalogue lacks in some more, and asks `rf.discover` what is missing.
+# The toolkit is not limited to flexible joints. This notebook describes another machine in a few lines, adds
+# an effect that the catalogue lacks, and searches for what is missing with `rf.discover`.
 #
 # The machine: a motor turns a platter through a belt. An encoder sits on the motor. The platter has only
 # a tacho behind a rectifier, which reads the speed without its sign; no sensor shows the platter's angle.
@@ -35,10 +35,10 @@ GREY, RED, BLUE = "#9aa5b1", "#c8452f", "#0f6f86"
 # %% [markdown]
 # ## The machine
 #
-# Two coordinates: the angles of motor and platter. A port is where something can push: the motor, the
-# platter, and the belt, which feels the difference of the two angles. Everything else is an effect at a
-# port. The numbers are from data sheets, up to a quarter off; the motor's and the rectifier's are trusted,
-# since voltage and angles tell torques only up to one common factor.
+# Two coordinates: the angles of motor and platter. A port is a place where a torque can act: the motor, the
+# platter, and the belt, whose position is the difference of the two angles. Everything else is an effect at a
+# port. The values are from data sheets, up to a quarter off. Those of the motor and of the rectifier are
+# trusted, since voltage and angles determine torques only up to one common factor.
 
 # %%
 motor = Motor(at="motor", torque_constant=0.03, back_emf=0.03, resistance=2.0, gear_ratio=5.0)
@@ -86,13 +86,13 @@ plt.show()
 # %% [markdown]
 # ## An effect of my own
 #
-# Somebody says that the platter has a magnetic brake: its torque grows with the speed, reaches its
-# largest value at a certain speed, and falls beyond. The catalogue has no such thing. A law is a small
+# Suppose that the platter has a magnetic brake: its torque grows with the speed, reaches its
+# largest value at a certain speed, and falls beyond. The catalogue has no such effect. An effect is a small
 # class; `@register` puts it into the catalogue, and from then on the search tries it like any other.
 #
-# `searched` says where, in the words of the flexible joint: at a driven port (`hub`), at one that is
-# carried along (`arm`), at a spring (`joint`). On this machine that means motor, platter and belt.
-# `probes` says with which numbers a first test should try it, in terms of the signals at its port.
+# `searched` says where, in the words of the flexible joint: at a port with a motor (`hub`), with a spring
+# (`joint`), or with neither (`arm`). On this machine these are motor, belt and platter.
+# `probes` gives the values with which a first test should try it, relative to the signals at its port.
 
 
 # %%
@@ -122,8 +122,8 @@ class MagneticBrake(Force):
 # %% [markdown]
 # ## What is missing?
 #
-# The same call as for any joint. Here it gets ten candidates and two rounds, so that this page is soon
-# done; leave both out and the search tries the whole catalogue, the new effect included, at every port
+# The call is the same as for a joint. Here it gets ten candidates and two rounds, to keep this notebook
+# short. Without both arguments the search tries the whole catalogue, the new effect included, at every port
 # where it makes sense, until nothing more is gained.
 
 # %%
@@ -138,7 +138,7 @@ print(result)
 figures.ranking(result)
 
 # %% [markdown]
-# The free run over the held-out data, before and after. Nothing of it was seen by a fit.
+# The free run over the held-out data, before and after. No fit has used them.
 
 # %%
 fig, axes = plt.subplots(2, 2, figsize=(10, 4.6), sharex=True, height_ratios=(1.6, 1))
@@ -158,7 +158,7 @@ plt.show()
 # %% [markdown]
 # ## Is it true?
 #
-# The file was simulated, so the hidden numbers are known.
+# The file was simulated, so the true values are known.
 
 # %%
 truth = {
@@ -177,10 +177,10 @@ for name, value in truth.items():
     print(f"{name:36}{value:8.4g}{first:>11}{after[name].value:17.4g} {after[name].unit}")
 
 # %% [markdown]
-# Without the two effects the fit books the brake and the friction as something else: look at the
-# platter's inertia and the belt in the middle column.
+# Without the two effects the fit attributes brake and friction to other parameters: see the platter's inertia
+# and the belt's stiffness in the column *as it was*.
 #
-# ## And then?
+# ## What next?
 #
 # The model can be saved, written as equations, or given to a controller as C code, the new effect
 # included ([docs/export.md](../docs/export.md)):

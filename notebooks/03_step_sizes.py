@@ -10,12 +10,12 @@
 # # How large should the steps of LMS be?
 #
 # A second-order Volterra model adapted by LMS has two step sizes: one for its linear weights, one for the
-# products. Too small, and the record ends before the weights have arrived; too large, and they never come
-# to rest, or run away. Usually they are set by hand. Here they are leaves of a pytree, so that the
-# derivative of the final error by the step sizes goes through every step of the filter, and a descent
-# finds them.
+# products. If they are too small, the record ends before the weights have settled; if they are too large, the
+# weights never settle, or diverge. Usually they are set by hand. Here they are leaves of a pytree: the
+# derivative of the final error with respect to the step sizes is computed through every step of the filter,
+# and a descent by this derivative finds them.
 #
-# The joint is simulated, with friction, a dead zone and an amplifier that is 0.3 V off; five delays of
+# The joint is simulated, with friction, a dead zone and an amplifier with an offset of 0.3 V; five delays of
 # 0.1 s, as in the [paper this began with](01_what_the_paper_did.ipynb).
 
 # %%
@@ -45,7 +45,7 @@ recordings[0]
 # ## How large may they be?
 #
 # For a regressor with given moments there is an exact bound on the step size, beyond which the *mean
-# square* of the weights grows without end. It is lower than the bound that textbooks give for the mean
+# square* of the weights grows without limit. It is lower than the bound that textbooks give for the mean
 # alone.
 
 # %%
@@ -55,11 +55,11 @@ mean, mean_square = adaptive.mean_bound(moments), adaptive.mean_square_bound(mom
 print(f"one step size for all weights: {mean:.4f} by the mean, {mean_square:.4f} by the mean square")
 
 # %% [markdown]
-# ## What do the step sizes decide?
+# ## How does the error depend on the step sizes?
 #
-# A map first, so that the descent has nothing to hide: the error of the final, frozen weights on records
-# they have not seen, above the best that any weights of this model can do (0.1 means 10 % more squared
-# error).
+# First a map, with which the descent can be compared. It shows the error of the final, frozen weights on
+# records to which they were not adapted, relative to the least error that any weights of this model have
+# (0.1 means 10 % more squared error).
 
 
 # %%
@@ -73,7 +73,7 @@ tried = adaptive.grid(two_steps, axes, basis, train, "alpha", objective="final",
 print(tried)
 
 # %% [markdown]
-# ## Down the slope, from four corners
+# ## Descent by the gradient, from four starts
 
 # %%
 corners = [{"mu1": a, "mu2": b} for a in (1e-3, 0.03) for b in (1e-4, 2e-3)]
@@ -97,13 +97,13 @@ ax.set_title("lighter is better", loc="left")
 plt.show()
 
 # %% [markdown]
-# All four descents end in one place, none higher than the best of the 225 points of the grid, for less
-# than a third of its filter runs. And the answer is safe: the last line of the table compares it with the
-# bound.
+# All four descents end at the same point. Its error is not larger than that of the best of the 225 points of
+# the grid, and they needed less than a third of its filter runs. The last line of the table compares the step
+# sizes with the bound: the filter is stable.
 #
 # ## Is the filter the right tool?
 #
-# Step sizes are a property of LMS, not of the data. Least squares has none, and reads the same record
+# Step sizes are a property of LMS, not of the data. Least squares has none, and uses the same record
 # once.
 
 # %%

@@ -10,9 +10,9 @@
 # # What does each effect do to the motion?
 #
 # A textbook joint has inertias, a spring, a motor and viscous damping. A real one has more. This notebook
-# adds one effect at a time to the same joint, plays the same voltage, and looks: first at the motion
-# after a pulse, where dry friction shows itself best, then at which effects one must not hope to see with a
-# given input.
+# adds one effect at a time to the same joint and simulates it under the same voltage. The first part shows
+# the motion after a pulse, where dry friction is clearest. The second part shows which effects a given input
+# cannot show.
 
 # %%
 import matplotlib.pyplot as plt
@@ -30,9 +30,9 @@ joint
 # %% [markdown]
 # ## What does friction leave after a pulse?
 #
-# Two volts for half a second, then nothing. The linear joint comes to rest by the back-EMF of its motor.
-# With dry friction the hub *sticks*, and the arm rings on against a hub that does not move: at another
-# frequency, and with an envelope that is a straight line instead of an exponential.
+# Two volts for half a second, then nothing. The back-EMF of the motor brings the linear joint to rest.
+# With dry friction the hub *sticks*, and the arm continues to oscillate against a hub that does not move: at
+# another frequency, and with an envelope that is a straight line instead of an exponential.
 
 # %%
 Ts = 0.001
@@ -51,9 +51,9 @@ axes[0].legend()
 plt.show()
 
 # %% [markdown]
-# While the hub sticks, theory is short: the arm on its spring has the half period π √(J / K), and loses
-# twice level / K of its amplitude with every half cycle. Read both off the simulation, at the turning
-# points after the hub has come to rest.
+# While the hub sticks, the motion is known in closed form: the arm on its spring has the half period
+# π √(J/K), and loses twice level/K of its amplitude in every half cycle. Both are compared with the turning
+# points of the simulation after the hub has come to rest.
 
 # %%
 theta, alpha = runs["with dry friction"].T
@@ -70,9 +70,9 @@ print(f"loss per half cycle: simulated {np.mean(drops):.6f} rad, theory {2 * 0.0
 # %% [markdown]
 # ## How exact is one step per sample?
 #
-# The linear part is stepped exactly, and friction is a torque that stops a contact and then holds it.
-# There is no smoothing width. Against steps of a twentieth of the length, next to what usual smoothing
-# does to the same law:
+# The step of the linear part is exact, and friction is a torque that stops a contact and then holds it.
+# There is no smoothing width. The errors are differences from steps of a twentieth of the length, for this
+# step and for the usual smoothing of the same law:
 
 # %%
 noise = rf.data.excitation.noise(4000, 0.002, seed=3)
@@ -88,10 +88,10 @@ for name, error in errors.items():
 # %% [markdown]
 # ## Which effect shows under which voltage?
 #
-# Eight effects, each of a size that a real machine may have, and three inputs. The number is the change
-# of the motion in multiples of an encoder's rounding. A binary input never visits the band of a dead zone
-# and has no third level for a saturation to cut: what looks like a change there is one of gain, which a
-# fit takes away.
+# Eight effects, each of a size that a real machine may have, and three inputs. The numbers are changes of the
+# deflection in multiples of an encoder's rounding. A binary input has two levels only: it is never within a
+# dead zone, and a saturation limits both levels alike. There the change is one of the gain alone, and a fit
+# compensates for it by its parameters.
 
 # %%
 added = {
@@ -125,9 +125,9 @@ for name, row in zip(added, table, strict=True):
     print(f"{name:32}" + "".join(f"{value:9.1f}" for value in row))
 
 # %% [markdown]
-# Take the gain away: scale the linear run so that it comes as near as it can, and see what is left of the
-# last three. Under the binary input nothing is left of dead zone and saturation. A search says so: such a
-# candidate is listed as *not excited*, which is not the same as absent.
+# Remove the change of gain: scale the linear run so that it comes as near as possible, and see what is left
+# of the last three effects. Under the binary input nothing is left of dead zone and saturation. A search
+# lists such a candidate as *not excited*, which is not the same as absent.
 
 # %%
 left = {}

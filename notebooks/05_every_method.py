@@ -9,10 +9,9 @@
 # %% [markdown]
 # # Which method follows the joint best?
 #
-# Physics, linear state spaces, Volterra series, adaptive filters, sparse regression: each has its
-# advocates, and each is usually shown on data of its own. Here all learn from the same samples and are
-# evaluated on the same others, in *free run*: they get the voltage and the first 0.2 s of the angles, and
-# nothing else.
+# Physical models, linear state spaces, Volterra series, adaptive filters and sparse regression are usually
+# shown on different data. Here all are fitted to the same samples and evaluated on the same others, in *free
+# runs*: they get the voltage and the first 0.2 s of the angles, and nothing else.
 
 # %%
 import matplotlib.pyplot as plt
@@ -28,9 +27,9 @@ recording
 
 # %% [markdown]
 # The recording (ten seconds of it) comes with the package; it is simulated, with dry friction at the hub
-# and a spring that hardens. `linear` and `grey_box` are the two ends of physics: the textbook joint, and
-# the joint with both effects built in. Twenty more methods are a name each; `rf.compare(recording)` runs
-# them all, and [docs/compare.md](../docs/compare.md) shows them on a measured joint.
+# and a spring that hardens. Two of the methods are physical: `linear` is the textbook joint, and `grey_box`
+# the joint with both effects. `rf.compare(recording)` runs all methods, twenty more than here, and
+# [docs/compare.md](../docs/compare.md) shows them on a measured joint.
 
 # %%
 joint = rf.joints.paper() + rf.effects.Coulomb(at="hub") + rf.effects.CubicSpring(at="joint")
@@ -45,10 +44,10 @@ table
 table.plot()
 
 # %% [markdown]
-# ## How far does each see?
+# ## How does the error grow with time?
 #
-# The error against the time since the start of the run. What grows is what a method does not know; a
-# servo angle adds up the smallest error of torque.
+# The error over the time since the start of the run. It grows where the model is wrong: the hub angle
+# accumulates the smallest error of torque.
 
 # %%
 fig, axes = plt.subplots(1, 2, figsize=(10, 3.4))
@@ -64,13 +63,13 @@ fig.legend(*axes[0].get_legend_handles_labels(), loc="outside upper left", ncols
 plt.show()
 
 # %% [markdown]
-# - The joint **with the right physics** ends at the noise of the sensor and stays there. It has seven
-#   numbers, and each has a unit.
-# - A **sparse equation of motion** (weak SINDy) comes next, and far ahead of the rest: its library happens to
-#   hold the sign of a speed and the cube of an angle, which is what is hidden here.
-# - The **textbook joint** follows theta better than every Volterra series, although it lacks two effects: it
-#   at least knows that a voltage turns into a torque.
-# - **One step ahead**, in the last columns, every method looks excellent. At this sampling rate the last
+# - The error of the joint **with the right physics** is at the noise of the sensor and stays there. It has
+#   seven fitted parameters, and each has a unit.
+# - A **sparse equation of motion** (weak SINDy) has the second smallest error, far below the others: its
+#   library contains the sign of a speed and the cube of an angle, which are the two hidden effects.
+# - The **textbook joint** follows theta better than every Volterra series, although it lacks two effects: in
+#   its equations a voltage causes a torque, and a torque an acceleration.
+# - **One step ahead** (columns *1 step*) every method has a small error. At this sampling rate the last
 #   sample alone predicts the next one well; such an error says nothing about a model.
 #
 # The last cell checks what the text says.

@@ -9,10 +9,10 @@
 # %% [markdown]
 # # Which effect is missing?
 #
-# `rf.discover` compares a model with recordings, proposes effects, tries them and keeps what unseen data
-# ask for. Whether its answer is *true* can only be seen where the truth is known. So first a recording
-# from a simulator that shares no code with the package, then two runs of a real joint, where nobody
-# knows.
+# `rf.discover` compares a model with recordings, proposes effects, tries them and keeps those that data
+# without a fit prefer. Whether its answer is *true* can only be checked where the truth is known. So the
+# first recording is from a simulator that shares no code with the package. Two runs of a real joint follow,
+# whose truth is not known.
 
 # %%
 import sys
@@ -29,8 +29,8 @@ from rotflex_jax.report import figures
 # %% [markdown]
 # ## Something is hidden. What?
 #
-# The machine is a joint whose constants are up to 20 % off those of the data sheet. The simulator steps
-# in 20 µs, treats dry friction as the set-valued law it is, and hides **Stribeck friction at the hub**:
+# The machine is a joint whose constants are up to 20 % off those of the data sheet. The simulator has steps
+# of 20 µs and treats dry friction as a set-valued law. The hidden effect is **Stribeck friction at the hub**:
 # 0.05 N m to break away, 0.02 N m while it slides.
 
 # %%
@@ -45,9 +45,9 @@ simulated = rf.discover(rf.joints.paper(), train, test, progress=rf.live())
 simulated
 
 # %% [markdown]
-# The ranking is what the search saw before it added anything: how much likelier the data are with each
-# effect, in nats (ten are strong evidence). Laws of friction at the hub stand together on top, since they
-# resemble each other; refits and unseen data tell them apart.
+# The ranking is the first score, before anything was added: how much likelier the data would be with each
+# effect, in nats (ten are strong evidence). The laws of friction at the hub are at the top together, since
+# they are similar; refits and validation data distinguish them.
 
 # %%
 figures.ranking(simulated)
@@ -62,8 +62,8 @@ for name, true in hidden["stribeck"].items():
 # ## And on a real joint?
 #
 # Two runs of 10 s of a rotary flexible joint in a students' laboratory, each under a controller of its
-# own, 500 samples a second. The search starts from the maker's model, learns from run A, and is evaluated on
-# run B. One effect at most is asked for here, to keep this page short; the whole search is in
+# own, 500 samples a second. The search starts from the maker's model, is fitted to run A, and decides on
+# run B. It adds one effect at most here, to keep this notebook short; the whole search is in
 # [docs/measured_joint.md](../docs/measured_joint.md). The recordings belong to those who made them: `rotflex
 # data fetch rotflex` takes them from their public address.
 
@@ -81,14 +81,14 @@ measured = run_a and rf.discover(maker, run_a, run_b, rounds=1, progress=rf.live
 measured
 
 # %% [markdown]
-# Friction at the hub is named, and the held-out error of theta falls several times. But the verdict is
-# honest: *something remains*. The errors are still many times the noise of the sensors. That of the
-# deflection may fall a little or grow: the fit of the maker's model has several ends, and the rounding of
-# a processor may decide between them. The page on the measured joint follows up what is missing.
-# `rf.explore(measured, run_b)` puts the model under sliders: switch an effect off, move a number, and see
-# at once what it does to the run and to its error (`pip install "rotflex_jax[notebook]"`).
+# Friction at the hub is named, and the held-out error of theta becomes several times smaller. But the verdict
+# is `unexplained`: something remains. The errors are still many times the noise of the sensors. The error of
+# the deflection may fall a little or grow: the fit of the maker's model has several local minima, and the
+# rounding of a processor may decide between them. The page on the measured joint says what else is missing.
+# `rf.explore(measured, run_b)` shows sliders for the model: switch an effect off or move a parameter, and see
+# at once how the run and its error change (`pip install "rotflex_jax[notebook]"`).
 #
-# Measured against simulated on the run that no fit has seen:
+# Measured and simulated outputs of run B, to which these models were not fitted:
 
 # %%
 measured and figures.overlay(measured)

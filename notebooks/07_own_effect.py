@@ -9,11 +9,10 @@
 # %% [markdown]
 # # What if the effect I suspect is not in the catalogue?
 #
-# Then the search finds a relative of it, or nothing, and says `unexplained`. You look at where the model
-# still fails, get an idea, and write it down: an effect is a class with two methods, its law and the
-# values to try first, and from then on the search tries it like any other. Here the hidden effect is friction
-# that changes with the *angle* of the hub, as a bent shaft or a worn gear makes it. No effect of the
-# catalogue does that.
+# Then the search finds a similar effect, or none, and its verdict is `unexplained`. You look at where the
+# model still fails and write down an effect of your own: a class with two methods, its law and the values to
+# try first. From then on the search tries it like any other. Here the hidden effect is friction that changes
+# with the *angle* of the hub, as a bent shaft or a worn gear causes it. No effect of the catalogue does that.
 
 # %%
 import dataclasses
@@ -40,19 +39,19 @@ recording = rf.Recording(u=made["u"], y=made["y"], Ts=made["Ts"], source="indepe
 train, test = recording.split(0.7)
 
 # %% [markdown]
-# ## What does the catalogue make of it?
+# ## What does the usual friction leave?
 #
-# Friction at the hub, clearly. Fit the usual effect and look at what is left.
+# Friction at the hub is the obvious candidate. Fit the usual effect and look at what is left.
 
 # %%
 usual = rf.fit(rf.joints.paper() + fx.Coulomb(at="hub"), train)
 usual
 
 # %% [markdown]
-# `rf.latent_torque` gives the hub an unknown torque and smooths it out of the recording. Friction of the
-# right level would leave nothing. What is left is drawn against the *angle*, for each way of turning: two
-# curves that mirror each other and cross zero together. So it is friction, too large at some angles and too
-# small at others.
+# `rf.latent_torque` adds an unknown torque at the hub and estimates it by a smoother. Friction of the
+# right level would leave nothing. The figure shows what is left over the *angle*, for each direction of
+# motion: the two curves are mirror images of each other and cross zero at the same angles. So it is friction,
+# whose level in the model is too large at some angles and too small at others.
 
 # %%
 torque = rf.latent_torque(usual.model, train)
@@ -75,9 +74,9 @@ plt.show()
 # %% [markdown]
 # ## Write it down
 #
-# A friction whose level goes with the angle: `limit` gives the level, and the step makes it stick. The
-# class says what its numbers are, in which units, which of them switch it off at zero, and with which the
-# search should try it.
+# A friction whose level depends on the angle: `limit` gives the level, and the integration step lets the port
+# stick. The class declares its parameters with units, which of them are amplitudes (at zero the effect is
+# absent), and the values with which the search should try it.
 
 
 # %%
@@ -123,15 +122,15 @@ for name, error in errors.items():
 mine
 
 # %% [markdown]
-# An effect that is registered takes part in `rf.discover`, beside all the others and with no hint: [this
-# notebook](02_own_machine.ipynb) lets the search find an effect of one's own in a machine of one's own.
-# For a law that others may need, [CONTRIBUTING.md](../CONTRIBUTING.md) says where the file goes; the
-# conformance tests take it up by themselves.
+# `rf.discover` tries a registered effect beside all others: in [this notebook](02_own_machine.ipynb) the
+# search finds such an effect in another machine. For a law that others may need,
+# [CONTRIBUTING.md](../CONTRIBUTING.md) says where the file goes; most conformance tests include it
+# automatically.
 #
 # ## Is it true?
 #
-# Hidden was a level of 0.04 N m that goes up and down by 80 %, as the sine of three times the angle. The hub
-# has seen a part of a turn only; level and share are found within a tenth all the same.
+# The hidden level is 0.04 N m and varies by 80 %, as the sine of three times the angle. The hub has moved
+# over a part of a turn only; level and share are nevertheless found within a tenth.
 
 # %%
 level, sine, cosine = (mine[f"hub.patchy_friction.{name}"] for name in ("level", "sine", "cosine"))

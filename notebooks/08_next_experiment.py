@@ -10,8 +10,8 @@
 # # What should I record next?
 #
 # Sometimes two effects explain a recording equally well. A delay of the voltage and a lag of the
-# amplifier are such a pair: for slow motions they are the same. Then the question is not which model to
-# choose, but which voltage to play next, so that the answer becomes plain, within what the machine bears.
+# amplifier are such a pair: for slow motions they are the same. Then the question is which voltage to play
+# next, within the limits of the machine, so that the new recording decides between the two.
 #
 # The machine here is an independent simulator that hides a delay of 1.2 ms.
 
@@ -59,9 +59,9 @@ print(f"{before:.1f} nat in favour of the delay")
 # %% [markdown]
 # ## Which input tells them apart?
 #
-# Within 6 V, 90 degrees of travel and 10 degrees of deflection. An input is worth what the best imitation
-# by the rival leaves of the run, whichever of the two is true; the standard inputs are ranked, and the
-# best one is improved along the slope through both simulations.
+# The limits are 6 V, 90 degrees of travel and 10 degrees of deflection. The worth of an input is what the
+# best fit of the rival leaves of the run, for the worse of the two cases (one effect is true, or the other).
+# The standard inputs are ranked, and the best one is improved by the gradient through both simulations.
 
 # %%
 limits = rf.Limits(voltage=6.0, travel=np.deg2rad(90), deflection=np.deg2rad(10))
@@ -81,12 +81,12 @@ print(designed)
 designed.plot()
 
 # %% [markdown]
-# It lies within the limits, and it looks like nothing one would have thought of. Where the deflection
-# binds, it leaves the resonance out and spends the voltage where the two differ.
+# The input is within the limits, and it resembles none of the standard inputs. Where the deflection is the
+# active limit, it leaves out the resonance and uses the voltage at frequencies where the two effects differ.
 #
 # ## Was it worth it?
 #
-# Play it on the machine, with fresh noise of the sensors, and ask both models again.
+# Play it on the machine, with new noise of the sensors, and fit both models again.
 
 # %%
 answer = play(played=designed.u)

@@ -9,10 +9,10 @@
 # %% [markdown]
 # # What if I have many recordings?
 #
-# A machine recorded every week, a batch of machines: which of them has changed, and how? `rf.fleet`
-# searches every recording by itself and sums them up. Here are eight, made by the independent simulator:
-# each is a machine of its own, healthy, with dry friction at the hub, or with a spring that hardens. A
-# ninth file is broken.
+# There may be a recording of one machine from every week, or of every machine of a batch: what has changed,
+# and how? `rf.fleet` searches every recording separately and summarises the results. Here are eight
+# recordings, made by the independent simulator: each is of another machine, which is healthy, has dry
+# friction at the hub, or has a spring that hardens. A ninth file is damaged.
 
 # %%
 import functools
@@ -64,8 +64,8 @@ for row in result.rows:
     print(f"{row.name:16} {row.verdict or 'failed':16} {row.found or row.reason}")
 
 # %% [markdown]
-# A file that cannot be used is a row with its reason, and no end. What has been found is on disk: the
-# same call again has nothing left to do, and with more files in the folder it would only search these.
+# A file that cannot be used is a row with the reason, and the call continues. Finished results are on disk:
+# the same call again has nothing left to do, and if files are added it searches only these.
 
 # %%
 again = fleet()
@@ -92,14 +92,14 @@ fig.legend(*axes[0].get_legend_handles_labels(), loc="outside upper left", ncols
 plt.show()
 
 # %% [markdown]
-# The page `summary.html` in the folder of the result shows the same for hundreds of recordings,
-# `summary.csv` has the numbers, and `models/` a model for each. On the command line it is `rotflex
-# discover data/*.csv --each`; [docs/many_recordings.md](../docs/many_recordings.md) tells how to stop, go
-# on, and use several machines.
+# The page `summary.html` in the folder of the result shows the same for hundreds of recordings, `summary.csv`
+# has the numbers, and `models/` a model for each. On the command line it is
+# `rotflex discover data/*.csv --each`; [docs/many_recordings.md](../docs/many_recordings.md) says how to
+# stop, continue, and use several machines.
 #
 # When not to use it: recordings of *one* machine in *one* state belong together. `rf.discover(joint, [a,
-# b], test)` fits them with the same numbers and sees more than two searches. The last cell checks what
-# the text says.
+# b], validation)` fits them with the same parameters and finds more than two searches. The last cell checks
+# what the text says.
 
 # %%
 EXPECTED = {"healthy": "", "rubbing": "coulomb@hub", "stiffening": "cubic_spring@joint"}

@@ -9,9 +9,9 @@
 # %% [markdown]
 # # Does the found effect make the joint follow better?
 #
-# A recording of a joint has been searched, and dry friction was found at the hub. What is that worth? This
-# notebook closes the loop: a controller is designed on the fitted model, once with the found friction
-# and once without, and drives the machine.
+# A search of a recording has found dry friction at the hub. How much smaller does it make the tracking error?
+# In this notebook a controller is designed from the fitted model, once with the found friction and once
+# without, and drives the machine.
 #
 # The machine is an independent simulator, which integrates in steps of 20 microseconds, counts its angles
 # with encoders, and shares no code with the toolkit.
@@ -35,7 +35,7 @@ recording = rf.Recording(u=record["u"], y=record["y"], Ts=record["Ts"], source="
 # %% [markdown]
 # ## The model
 #
-# The fit sees the recording alone. The friction that is hidden in the machine is 0.1 N m.
+# The fit uses the recording alone. The friction that is hidden in the machine is 0.1 N m.
 
 # %%
 fit = rf.fit(rf.joints.paper() + fx.Coulomb("hub", level=0.03), recording)
@@ -44,8 +44,8 @@ print(fit["hub.coulomb.level"])
 # %% [markdown]
 # ## With and without
 #
-# Feedback, observer and reference are the same. The only difference is whether the planned motion has the
-# torque of the found friction in it.
+# Feedback, observer and reference are the same. The only difference is whether the planned motion includes
+# the torque of the found friction.
 
 # %%
 t = recording.Ts * np.arange(1000)
@@ -64,15 +64,16 @@ runs["feedforward"].plot(runs["nothing"])
 # %% [markdown]
 # ## Every model that is still possible
 #
-# The recording leaves the parameters open within their intervals. The same controller drives models drawn
-# from that distribution; the table names the worst case, and a model that would break the loop.
+# The recording determines the parameters within intervals. The same controller drives models drawn
+# from their distribution; the result names the worst case, and each model with which the loop diverges or has
+# a limit cycle.
 
 # %%
 assessment = rf.assess(controller, fit, reference[:1000], count=8, hold=3.0)
 assessment
 
 # %% [markdown]
-# A model that does break it: an amplifier that answers 14 ms late. The assessment says so.
+# A model with which the loop fails: an amplifier with a delay of 14 ms. The assessment says so.
 
 # %%
 late = rf.assess(
