@@ -5,6 +5,7 @@ import functools
 import hashlib
 import json
 import os
+import shlex
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
@@ -335,6 +336,27 @@ def test_simulate_tells_errors_and_saves(run, recorded, tmp_path) -> None:
     assert f"Fit, where 100 % is perfect: theta {theta:.1f} %, alpha {alpha:.1f} %" in out
 
 
+def test_check_lists_columns_that_are_not_read_beside_a_single_sensor(run, tmp_path) -> None:
+    """The command in the note reads both sensors."""
+    file = write(tmp_path / "tip.csv", DEMO, ("t", "voltage", "Theta [rad]", "tip angle"))
+    out = run("check", file)[1]
+    (note,) = (line for line in out.splitlines() if "not read" in line)
+    assert "'Theta [rad]'; not read: 'tip angle'." in note
+    named = shlex.split(note.partition("such as ")[2].rstrip("."))
+    status, out, _ = run("check", file, *named)
+    assert status == 0 and "not read" not in out
+    assert "The signs of theta and alpha do not contradict paper." in out
+
+
+def test_check_does_not_compare_signs_beside_a_signal(run, tmp_path) -> None:
+    """A wrong sign is refused in the same file without the signal."""
+    names = (*NAMES, "acc [m/s^2]")
+    file = write(tmp_path / "base.csv", np.c_[DEMO * [1, 1, 1, -1], np.sin(DEMO[:, 0])], names)
+    assert run("check", file)[0] == 2
+    status, out, _ = run("check", file, "--signal", "acc [m/s^2]")
+    assert status == 0 and "The signs of theta and alpha were not compared with paper" in out
+
+
 def test_check_tells_what_is_in_a_file_and_refuses_a_wrong_sign(run, recorded, tmp_path) -> None:
     status, out, err = run("check", recorded)
     assert (status, err) == (0, "")
@@ -343,7 +365,7 @@ def test_check_tells_what_is_in_a_file_and_refuses_a_wrong_sign(run, recorded, t
     (row,) = (line.split() for line in out.splitlines() if line.startswith("theta "))
     assert row[:4] == ["theta", "deg", *(digits(end) for end in ends)]
     assert "note: Channel 'theta' is quantised" in out and "note: 1.2 s are little for a search" in out
-    assert "The signs of theta and alpha are those of paper." in out
+    assert "The signs of theta and alpha do not contradict paper." in out and "not read" not in out
     status, _, err = run("check", write(tmp_path / "turned.csv", DEMO * [1, 1, 1, -1]))
     assert status == 2
     assert_one_sentence(err, "turned.csv", "negate the column of alpha")

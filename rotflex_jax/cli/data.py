@@ -85,7 +85,13 @@ def check(
             check_signs(model, [recording])
         except InputError as error:
             raise InputError(f"{name}: {error}") from None
-        terminal.message(f"The signs of {' and '.join(model.mechanism.channels)} are those of {joint}.")
+        channels = " and ".join(model.mechanism.channels)
+        terminal.message(
+            f"The signs of {channels} were not compared with {joint}, since a signal may move the machine "
+            "more than the input does."
+            if recording.signals
+            else f"The signs of {channels} do not contradict {joint}."
+        )
         if named:
             _say_what_can_be_known(model, recording, joint)
 

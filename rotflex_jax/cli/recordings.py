@@ -3,10 +3,12 @@
 import dataclasses
 import functools
 import inspect
+import shlex
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from rotflex_jax.cli import terminal
 from rotflex_jax.cli.arguments import (
     Accept,
     ArmAbsolute,
@@ -137,7 +139,10 @@ class Columns:
         }
 
     def sensor_alone(self, file: Path) -> str | None:
-        """The only sensor of a joint that the options name or that a file has; None if it is not just one."""
+        """The only sensor of a joint that the options name or that a file has; None if it is not just one.
+
+        Other numeric columns of the file are listed in a note, since one may be a sensor with another name.
+        """
         from rotflex_jax.data.columns import OTHER_NAMES
         from rotflex_jax.data.files import read_table
         from rotflex_jax.joints.rotary_flexible import SENSORS
@@ -149,8 +154,22 @@ class Columns:
             table = read_table(file)
         except (InputError, OSError):
             return None  # loading the file later reports the reason
-        found = [c for c in SENSORS if table.find(c, *OTHER_NAMES.get(c, ())) in table.columns]
-        return found[0] if found and (len(found) == 1 or "alpha" not in found) else None
+        column = {name: table.find(name, *OTHER_NAMES.get(name, ())) for name in ("t", *SENSORS)}
+        found = [c for c in SENSORS if column[c] in table.columns]
+        if not found or (len(found) > 1 and "alpha" in found):
+            return None
+        signals = [text.partition("=")[2] or text for text in self.signals or ()]
+        known = {*column.values(), *map(table.find, (self.time or "t", self.input or "voltage", *signals))}
+        others = [c for c, values in table.columns.items() if c not in known and values.dtype.kind in "fiu"]
+        if others:
+            sensor, other = found[0], next(c for c in SENSORS if c not in found)
+            both = (f"{sensor}={column[sensor]}", f"{other}={others[0]}")
+            terminal.message(
+                f"note: The output that is read from {file.name} is {column[sensor]!r}; not read: "
+                f"{', '.join(map(repr, others))}. If another sensor is among these, name both, such as "
+                f"{' '.join(f'--output {shlex.quote(each)}' for each in both)}."
+            )
+        return found[0]
 
     def load_all(self, files: Sequence[Path]) -> "list[Recording]":
         """Recordings from files, and from public data sets whose names are given in place of a file."""
