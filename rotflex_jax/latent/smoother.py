@@ -122,7 +122,7 @@ def log_likelihood(
 
     P = expand_axes(jnp.diag(start.variance), Q[None])
     first = (
-        jnp.broadcast_to(expand_axes(start.mean, Q), Q.shape),
+        jnp.broadcast_to(expand_axes(jnp.asarray(start.mean), Q), Q.shape),
         jnp.broadcast_to(P, (len(Q), *Q.shape)),
         jnp.zeros(Q.shape[1:], Q.dtype),
     )
