@@ -145,7 +145,7 @@ def compare(
     methods: given.Methods = None,
     quick: given.Quick = False,
     joints: given.JointNames = None,
-    held_out: given.HeldOut = None,
+    held_out: given.HeldOutForErrors = None,
     split: given.Share = None,
     report: given.ReportFolder = None,
     json_file: given.JsonFile = None,

@@ -130,6 +130,10 @@ HeldOut = Annotated[
     list[Path] | None,
     typer.Option("--held-out", metavar="FILE", help="Recording held out for validation; may be repeated."),
 ]
+HeldOutForErrors = Annotated[
+    list[Path] | None,
+    typer.Option("--held-out", metavar="FILE", help="Recording for the errors only; may be repeated."),
+]
 Test = Annotated[
     list[Path] | None,
     typer.Option(

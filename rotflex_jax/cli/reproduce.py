@@ -21,7 +21,7 @@ def reproduce(
     changes: given.Changes = None,
     listed: given.ListSettings = False,
     joints: given.JointNames = None,
-    held_out: given.HeldOut = None,
+    held_out: given.HeldOutForErrors = None,
     split: given.Share = None,
     json_file: given.JsonFile = None,
     *,
