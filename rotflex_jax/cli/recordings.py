@@ -29,6 +29,7 @@ from rotflex_jax.errors import InputError
 from rotflex_jax.joints.by_name import imported
 
 if TYPE_CHECKING:
+    from rotflex_jax.data.tables import Table
     from rotflex_jax.models.model import Model
     from rotflex_jax.recording import Recording
 
@@ -141,7 +142,7 @@ class Columns:
     def sensor_alone(self, file: Path) -> str | None:
         """The only sensor of a joint that the options name or that a file has; None if it is not just one.
 
-        Other numeric columns of the file are listed in a note, since one may be a sensor with another name.
+        A note lists the other columns of the file, since one may be a sensor with another name.
         """
         from rotflex_jax.data.columns import OTHER_NAMES
         from rotflex_jax.data.files import read_table
@@ -158,18 +159,32 @@ class Columns:
         found = [c for c in SENSORS if column[c] in table.columns]
         if not found or (len(found) > 1 and "alpha" in found):
             return None
+        self._say_what_is_not_read(file.name, table, column, found[0])
+        return found[0]
+
+    def _say_what_is_not_read(
+        self, file: str, table: "Table", column: Mapping[str, str], sensor: str
+    ) -> None:
+        """Print a note on numeric columns of a file of which only one sensor is read.
+
+        Args:
+            file: Name of the file.
+            table: The columns of the file.
+            column: Name of a sensor, or `t` -> name of its column.
+            sensor: The sensor that is read.
+        """
         signals = [text.partition("=")[2] or text for text in self.signals or ()]
         known = {*column.values(), *map(table.find, (self.time or "t", self.input or "voltage", *signals))}
         others = [c for c, values in table.columns.items() if c not in known and values.dtype.kind in "fiu"]
         if others:
-            sensor, other = found[0], next(c for c in SENSORS if c not in found)
+            other = "theta" if sensor == "alpha" else "alpha"
             both = (f"{sensor}={column[sensor]}", f"{other}={others[0]}")
             terminal.message(
-                f"note: The output that is read from {file.name} is {column[sensor]!r}; not read: "
+                f"note: The output that is read from {file} is {column[sensor]!r}; not read: "
                 f"{', '.join(map(repr, others))}. If another sensor is among these, name both, such as "
-                f"{' '.join(f'--output {shlex.quote(each)}' for each in both)}."
+                f"{' '.join(f'--output {shlex.quote(each)}' for each in both)}.",
+                error=True,  # stdout may be for JSON
             )
-        return found[0]
 
     def load_all(self, files: Sequence[Path]) -> "list[Recording]":
         """Recordings from files, and from public data sets whose names are given in place of a file."""
