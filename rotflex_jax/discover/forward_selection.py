@@ -34,8 +34,8 @@ from rotflex_jax.runtime.xla import on_threads
 # Number of candidates that are refitted in a round, to which the best one of each horizon is added, and
 # largest number of rounds.
 REFITTED, ROUNDS = 4, 4
-# Number of laws of dry friction that are refitted beside a model of the first round beside which none is
-# tried, if the round adds nothing or there are several runs. The simplest law at the same port is added.
+# Number of laws of dry friction that are refitted beside a model beside which none is tried, see
+# `_dry_friction`. The simplest law at the same port is added.
 FRICTION_LAWS = 2
 
 
@@ -71,7 +71,8 @@ def score_candidates(state: SearchState) -> list[Promising]:
     if state.origin is not state.current:
         state.say("the model as it is was fitted far from the values given: candidates beside both")
         found.append(_promising(state, state.current))
-    if state.problem.several_runs:  # where friction differs between runs, its slopes with one size are small
+    # Where friction differs between runs, its slopes with one size are small. Further rounds: other motors.
+    if state.problem.several_runs or state.scores:
         found += _dry_friction(state, found)
     return [p for p in found if p.starts]
 
@@ -119,29 +120,32 @@ def add_dry_friction(state: SearchState, promising: Sequence[Promising]) -> bool
 
 
 def _dry_friction(state: SearchState, promising: Sequence[Promising]) -> list[Promising]:
-    """Laws of dry friction at the motors, beside each model of the first round beside which none is tried.
+    """Laws of dry friction at the motors, beside each model of the round beside which none is tried.
 
-    There are none if the model explains the recordings.
+    They belong to the first round. In a machine with several motors, further rounds have laws at the other
+    motors once there is dry friction at one. There are none if the model explains the recordings.
 
     Args:
         state: The search with what it has found so far.
         promising: Candidates that the round tries.
     """
     s = state.problem.supermodel
-    if state.scores or any(law_of(e.name) == DRY_FRICTION for e in s.baseline.effects):
-        return []
-    if not is_unexplained(state.horizons, state.current):
-        return []
     motors = {port for port in s.baseline.port_vectors if s.baseline.has_motor(port)}
     driven = motors | {e.port for e in s.baseline.effects if e.signal}
+    there = {e.port for e in s.baseline.effects if law_of(e.name) == DRY_FRICTION}
+    there |= {p.port for p in state.current.hypothesis.locations if law_of(p.effect) == DRY_FRICTION}
+    if (state.scores or there) and not there & driven:
+        return []
+    if driven <= there or not is_unexplained(state.horizons, state.current):
+        return []
     chosen = []
     for beside in [state.origin] if state.origin is state.current else [state.origin, state.current]:
-        tried = [start.location.effect for p in promising if p.beside is beside for start in p.starts]
-        if any(law_of(name) == DRY_FRICTION for name in tried):
+        tried = [start.location for p in promising if p.beside is beside for start in p.starts]
+        if any(law_of(p.effect) == DRY_FRICTION and (not there or p.port in driven - there) for p in tried):
             continue
         tests = state.score_tests(beside)
         order = best_candidates(*tests, len(s.candidates))
-        laws = [p for p in order if law_of(p.effect) == DRY_FRICTION and p.port in driven]
+        laws = [p for p in order if law_of(p.effect) == DRY_FRICTION and p.port in driven - there]
         # The simplest law converges from starts far away, where richer ones often do not.
         simplest = [p for p in laws if p.port == laws[0].port and not CATALOG[p.effect].contains]
         laws = list(dict.fromkeys([*laws[:FRICTION_LAWS], *simplest]))
