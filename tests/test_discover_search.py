@@ -4,7 +4,7 @@ import dataclasses
 import math
 from collections.abc import Callable
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -18,6 +18,7 @@ from rotflex_jax.discover.checkpoint import AddedEffect
 from rotflex_jax.discover.hypothesis import CandidateStart
 from rotflex_jax.discover.supermodel import EffectLocation
 from rotflex_jax.discover.verdict import NEAR_FLOOR, TORQUE_NATS, Assessment, in_noise
+from rotflex_jax.effects.base import driven_place
 from rotflex_jax.errors import InputError
 from rotflex_jax.recording.recording import check_apart, shared_samples
 from rotflex_jax.runtime.persistent_jit import program_counts, release_programs
@@ -246,3 +247,51 @@ def test_dry_friction_is_tried_where_other_candidates_have_crowded_it_out(
     said.clear()
     rf.discover(SPINDLE + fx.Coulomb("shaft"), *parts, candidates=candidates, rounds=1, progress=said.append)
     assert not any("lugre at shaft" in line for line in said if line.startswith("refitting "))
+
+
+SECOND = fx.MeasuredDisturbance(driven_place("second", "voltage of the second [V]"), gain=0.025)
+TWO_SPINDLES = rf.Mechanism(
+    coordinates=["phi", "psi"],
+    ports={"shaft": (1, 0), "second": (0, 1)},
+    effects=[*SPINDLE.effects, fx.Inertia("second", inertia=0.017), fx.Viscous("second"), SECOND],
+    outputs={"tacho": ("shaft", "speed"), "other": ("second", "speed")},
+)
+
+
+@pytest.mark.parametrize(
+    ("model", "there", "tried", "expected"),
+    [
+        (TWO_SPINDLES, [("coulomb", "shaft")], [("sensor_bias", "other")], ["lugre", "coulomb"]),
+        (TWO_SPINDLES, [("coulomb", "shaft")], [("coulomb", "shaft")], ["lugre", "coulomb"]),
+        (TWO_SPINDLES, [("coulomb", "shaft")], [("coulomb", "second")], []),
+        (TWO_SPINDLES, [("coulomb", "shaft"), ("lugre", "second")], [], []),
+        (TWO_SPINDLES, [("dead_zone", "input")], [], []),
+        (TWO_SPINDLES + fx.Dahl("shaft"), [("sensor_bias", "other")], [], ["lugre", "coulomb"]),
+        (SPINDLE, [("coulomb", "shaft")], [], []),
+    ],
+)
+def test_once_one_motor_has_dry_friction_it_is_tried_at_the_others(
+    monkeypatch: pytest.MonkeyPatch, model, there, tried, expected
+) -> None:
+    """In the second round. `there` are effects of the model, `tried` is tried anyway.
+
+    The second spindle is driven by a signal.
+    """
+    ranked = [("lugre", "second"), ("coulomb", "shaft"), ("coulomb", "second")]
+    monkeypatch.setattr(forward_selection, "best_candidates", lambda *_: [EffectLocation(*p) for p in ranked])
+    monkeypatch.setattr(forward_selection, "is_unexplained", lambda *_: True)
+    monkeypatch.setattr(forward_selection.Promising, "at", lambda beside, scores, places: places)
+    current = SimpleNamespace(hypothesis=SimpleNamespace(locations=[EffectLocation(*p) for p in there]))
+    supermodel = SimpleNamespace(baseline=model, candidates=ranked)
+    state: Any = SimpleNamespace(
+        problem=SimpleNamespace(supermodel=supermodel),
+        scores=[[]],
+        origin=current,
+        current=current,
+        horizons=None,
+        score_tests=lambda _: [],
+    )
+    starts: Any = [SimpleNamespace(location=EffectLocation(*p)) for p in tried]
+    promising: Any = forward_selection.Promising(cast(Any, current), [], starts, starts)
+    found = [p for laws in forward_selection._dry_friction(state, [promising]) for p in cast(Any, laws)]
+    assert [p.effect for p in found] == expected and {p.port for p in found} <= {"second"}
