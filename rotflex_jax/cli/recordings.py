@@ -173,8 +173,11 @@ class Columns:
             column: Name of a sensor, or `t` -> name of its column.
             sensor: The sensor that is read.
         """
-        signals = [text.partition("=")[2] or text for text in self.signals or ()]
-        known = {*column.values(), *map(table.find, (self.time or "t", self.input or "voltage", *signals))}
+        from rotflex_jax.data.columns import named_signals
+
+        signals = named_signals(_signals(self.signals or (), ()), table).values()
+        named = map(table.find, (self.time or "t", self.input or "voltage"))
+        known = {*column.values(), *signals, *named, *table.clocks.values()}
         others = [c for c, values in table.columns.items() if c not in known and values.dtype.kind in "fiu"]
         if others:
             other = "theta" if sensor == "alpha" else "alpha"

@@ -134,18 +134,19 @@ def _dry_friction(state: SearchState, promising: Sequence[Promising]) -> list[Pr
     driven = motors | {e.port for e in s.baseline.effects if e.signal}
     there = {e.port for e in s.baseline.effects if law_of(e.name) == DRY_FRICTION}
     there |= {p.port for p in state.current.hypothesis.locations if law_of(p.effect) == DRY_FRICTION}
+    ports = driven - there
     if (state.scores or there) and not there & driven:
         return []
-    if driven <= there or not is_unexplained(state.horizons, state.current):
+    if not ports or not is_unexplained(state.horizons, state.current):
         return []
     chosen = []
     for beside in [state.origin] if state.origin is state.current else [state.origin, state.current]:
         tried = [start.location for p in promising if p.beside is beside for start in p.starts]
-        if any(law_of(p.effect) == DRY_FRICTION and (not there or p.port in driven - there) for p in tried):
+        if any(law_of(p.effect) == DRY_FRICTION and (not there or p.port in ports) for p in tried):
             continue
         tests = state.score_tests(beside)
         order = best_candidates(*tests, len(s.candidates))
-        laws = [p for p in order if law_of(p.effect) == DRY_FRICTION and p.port in driven - there]
+        laws = [p for p in order if law_of(p.effect) == DRY_FRICTION and p.port in ports]
         # The simplest law converges from starts far away, where richer ones often do not.
         simplest = [p for p in laws if p.port == laws[0].port and not CATALOG[p.effect].contains]
         laws = list(dict.fromkeys([*laws[:FRICTION_LAWS], *simplest]))

@@ -78,13 +78,13 @@ def _measurement_update(
     updates = []
     for c in range(H.shape[0]):
         h, r = expand_axes(H[c], m), noise[c] ** 2
-        Ph = jnp.sum(P * h[None], axis=1)
+        Ph = _times(P, h)
         S = jnp.sum(h * Ph, axis=0) + r
         K = seen * Ph / S[None]
         e = y[c] - jnp.sum(h * m, axis=0)
         m = m + K * e[None]
         half = P - K[:, None] * Ph[None]
-        P = half - jnp.sum(half * h[None], axis=1)[:, None] * K[None] + r * K[:, None] * K[None]
+        P = half - _times(half, h)[:, None] * K[None] + r * K[:, None] * K[None]
         updates.append(_ChannelUpdate(K, e, S))
     return m, (P + jnp.swapaxes(P, 0, 1)) / 2, updates
 
