@@ -54,7 +54,7 @@ def candidate(name: str, port: str, probes, one_sided=False, threshold=False) ->
 def made(candidates: list[Candidate], slopes: dict, r: np.ndarray) -> ScoreTest:
     """A score test with given derivatives, of which the baseline explains none."""
     columns = {key: [_Column(float(np.linalg.norm(x)), x) for x in rows] for key, rows in slopes.items()}
-    projected = _Projected(r, columns, float(SAMPLES), 1.0)
+    projected = _Projected(r, columns, float(SAMPLES), 1.0, lambda starts: 1.0)
     listed = sorted((_score(c, projected) for c in candidates), key=lambda s: -s.nats)
     return ScoreTest(listed, {c.location: c for c in candidates}, projected)
 
@@ -379,6 +379,28 @@ def test_a_pair_of_a_model_is_dense_least_squares_too(small):
         alone = {s.location: s.start.expected_gain for s in test.listed}
         assert p.gain >= max(alone[x] for x in p.locations) - 1e-6
         assert p.nats <= p.gain - np.log(problem.measured_values) + 1e-6
+
+
+def test_a_pair_counts_only_plausible_sizes(small):
+    """A pair of which one member is limited to half of its size gains three quarters, nearly."""
+    problem, h, test = small
+    s, spring = problem.supermodel, EffectLocation("cubic_spring", "joint")
+    (p,) = test.pairs([sp.HUB, spring])
+    (i,) = s.parameter_indices(sp.HUB)
+    limit = 0.5 * p.starts[0].values[0]
+    less = score_test(
+        problem, h, is_plausible=lambda grown, place: place != sp.HUB or grown.mean_values(s)[i] <= limit
+    )
+    (q,) = less.pairs([sp.HUB, spring])
+    share = q.starts[0].values[0] / p.starts[0].values[0]
+    assert 0.45 < share <= 0.5
+    assert q.starts[1].values[0] == pytest.approx(share * p.starts[1].values[0])
+    assert q.gain == pytest.approx((1 - (1 - share) ** 2) * p.gain)
+    alone = {x.location: x for x in less.listed}
+    assert q.more == pytest.approx(q.nats - max(0.0, *(alone[x].nats for x in q.locations)))
+    assert q.synergy == pytest.approx(
+        q.gain - sum(max(alone[x].start.expected_gain, 0.0) for x in q.locations)
+    )
 
 
 def test_a_refit_of_a_pair_reaches_what_its_score_promises(small):

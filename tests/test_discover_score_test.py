@@ -58,6 +58,28 @@ def test_a_score_foretells_the_gain_of_a_refit(weak):
     assert level == pytest.approx(SMALL, rel=0.4)
 
 
+def test_a_score_counts_only_a_plausible_size(weak):
+    """The gain of a limited friction is that of a fit of all else with this friction held."""
+    problem, h, found = weak
+    s, limit = problem.supermodel, 0.4 * found[sp.HUB].start.values[0]
+    (i,) = s.parameter_indices(sp.HUB)
+
+    def is_plausible(grown: Hypothesis, location: EffectLocation) -> bool:
+        return location != sp.HUB or grown.mean_values(s)[i] <= limit
+
+    limited = {x.location: x for x in score_test(problem, h, is_plausible=is_plausible).listed}
+    score = limited[sp.HUB]
+    assert 0.9 * limit < score.start.values[0] <= limit
+    held = dataclasses.replace(switched_on(problem, h, score), free=h.free)
+    (refitted,) = levenberg_marquardt(problem, [held])
+    assert gain(problem, score) == pytest.approx(refitted.log_likelihood - h.log_likelihood, rel=0.2)
+    assert gain(problem, score) < 0.75 * gain(problem, found[sp.HUB])
+    assert all(limited[p].start.expected_gain == found[p].start.expected_gain for p in found if p != sp.HUB)
+    # A fault that is not one of size does not limit the size.
+    never = {x.location: x for x in score_test(problem, h, is_plausible=lambda h, p: False).listed}
+    assert all(never[p].start.expected_gain == found[p].start.expected_gain for p in found)
+
+
 def test_the_true_effect_comes_first(weak):
     problem, h, found = weak
     listed = score_test(problem, h).listed

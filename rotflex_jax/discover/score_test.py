@@ -5,10 +5,15 @@ amplitudes are whitened, and their projection on everything that the baseline ca
 They give the log-likelihood that the effect would gain to first order (Rao's score statistic). Some effects
 do nothing at small amplitudes, such as play that is smaller than the motion of a tooth within a sample. For
 these, the change of the innovations in a run at full size replaces the slope.
+
+If the size that gains most is not plausible, such as an encoder that is off centre by a radian, the score is
+what the largest plausible share of it gains. Otherwise effects that no refit can keep would take the places
+of others among the few that are refitted.
 """
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+import functools
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -16,7 +21,7 @@ from jaxtyping import Float
 
 from rotflex_jax.discover.batched_predictor import ParameterSet
 from rotflex_jax.discover.candidate_slopes import MOST_LINES, Slopes, candidate_sensitivities
-from rotflex_jax.discover.hypothesis import CandidateStart, Hypothesis
+from rotflex_jax.discover.hypothesis import CandidateStart, Hypothesis, is_physical, with_candidate
 from rotflex_jax.discover.likelihood import LikelihoodProblem
 from rotflex_jax.discover.supermodel import Candidate, EffectLocation, ErrorLine, SuperModel
 from rotflex_jax.effects import CATALOG
@@ -34,6 +39,8 @@ MAX_THRESHOLD_AMPLITUDE = 1.5
 LEAST_SHARE = 0.25
 # Number of shapes, besides the best one, at which a refit may start.
 EXTRA_SHAPES = 2
+# The largest plausible share of a size is at least the first, and found in this number of halvings.
+LEAST_PLAUSIBLE_SHARE, HALVINGS = 1e-3, 6
 
 
 @dataclasses.dataclass(frozen=True)
@@ -96,19 +103,27 @@ def candidates_to_score(
     return {c.location: c for c in absent if c}
 
 
-def score_test(problem: LikelihoodProblem, h: Hypothesis, lines: Sequence[ErrorLine] = ()) -> "ScoreTest":
+def score_test(
+    problem: LikelihoodProblem,
+    h: Hypothesis,
+    lines: Sequence[ErrorLine] = (),
+    is_plausible: Callable[[Hypothesis, EffectLocation], bool] | None = None,
+) -> "ScoreTest":
     """The score test of all candidates that are not yet in a hypothesis.
 
     Args:
         problem: Likelihood of the recordings at one horizon.
         h: The hypothesis to which candidates would be added.
         lines: Lines at which a periodic disturbance is tried; without lines none is tried.
+        is_plausible: Whether an effect of a hypothesis is of a plausible size; if None, whether its
+            parameters lie in their physical ranges.
     """
     s, seen = problem.supermodel, problem.seen
     tried = candidates_to_score(s, h, lines)
     candidates = list(tried.values())
     if not candidates:
         return ScoreTest([], {}, None)
+    is_plausible = is_plausible or functools.partial(is_physical, s)
     thresholds = [c for c in candidates if c.threshold]
     make_ahead(lambda: list(_changes(problem, h, np.zeros(1), thresholds)))
     e, J = problem.slopes([h])
@@ -129,9 +144,33 @@ def score_test(problem: LikelihoodProblem, h: Hypothesis, lines: Sequence[ErrorL
             columns.setdefault(key, []).append(column)
     headroom = float(np.exp(h.whitener.log_det / (2 * e.shape[-1])) / np.exp(np.mean(np.log(problem.noise))))
     r = orthogonal(w[None])[0]
-    projected = _Projected(r, columns, problem.measured_values, max(headroom, 1.0))
+    share = functools.partial(_plausible_share, s, h, is_plausible)
+    projected = _Projected(r, columns, problem.measured_values, max(headroom, 1.0), share)
     listed = sorted((_score(c, projected) for c in candidates), key=lambda found: -found.nats)
     return ScoreTest(listed, tried, projected)
+
+
+def _plausible_share(
+    s: SuperModel,
+    h: Hypothesis,
+    is_plausible: Callable[[Hypothesis, EffectLocation], bool],
+    starts: Sequence[CandidateStart],
+) -> float:
+    """The largest share of the sizes of candidates, at most 1, at which each of them is plausible.
+
+    It is 1 if they are not plausible even where they are nearly absent, for then sizes are not the reason.
+    """
+
+    def plausible(share: float) -> bool:
+        return all(is_plausible(with_candidate(s, h, x, share), x.location) for x in starts)
+
+    low, high = LEAST_PLAUSIBLE_SHARE, 1.0
+    if plausible(high) or not plausible(low):
+        return 1.0
+    for _ in range(HALVINGS):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if plausible(middle) else (low, middle)
+    return low
 
 
 def _changes(
@@ -179,17 +218,40 @@ class _Projected:
         samples: Number of measured values.
         headroom: Size of the innovations over the sensor noise, at least 1: the factor by which the
             innovations would be smaller if the model were right.
+        plausible_share: The largest share of the sizes of candidates at which each of them is plausible.
     """
 
     r: Float[np.ndarray, " M"]
     columns: dict[tuple[EffectLocation, int], list[_Column]]
     samples: float
     headroom: float
+    plausible_share: Callable[[Sequence[CandidateStart]], float]
 
     def of(self, location: EffectLocation, shape: int) -> Float[np.ndarray, "k M"] | None:
         """Slopes of a shape after projection; None where they are not finite."""
         found = self.columns[(location, shape)]
         return np.array([c.left for c in found]) if all(np.isfinite(c.size) for c in found) else None
+
+    def limited(
+        self, starts: Sequence[CandidateStart], scaled: Sequence[tuple[bool, ...]]
+    ) -> tuple[CandidateStart, ...]:
+        """Starts of candidates that are added together, at the largest plausible share of their sizes.
+
+        The gain is a parabola of the share `x`, with its largest value `g` at 1, hence `x (2 - x) g`.
+
+        Args:
+            starts: The starts, with the gain of all of them together.
+            scaled: For each start, which of its values are sizes.
+        """
+        x = self.plausible_share(starts)
+        return tuple(
+            dataclasses.replace(
+                start,
+                values=np.where(sizes, x * start.values, start.values),
+                expected_gain=x * (2.0 - x) * start.expected_gain,
+            )
+            for start, sizes in zip(starts, scaled, strict=True)
+        )
 
 
 def _score(c: Candidate, projected: _Projected) -> Score:
@@ -216,9 +278,10 @@ def _score_of_shape(c: Candidate, shape: int, projected: _Projected) -> Score:
     if any(c.amplitudes):
         values = np.where(c.amplitudes, a @ group, values)
     strongest = max(float(left.max()) * projected.headroom, 1e-300)
+    (start,) = projected.limited([CandidateStart(c.location, values, expected_gain=gain)], [c.scaled])
     return Score(
-        CandidateStart(c.location, values, expected_gain=gain),
-        gain - 0.5 * df * float(np.log(projected.samples)),
+        start,
+        start.expected_gain - 0.5 * df * float(np.log(projected.samples)),
         excited=strongest**2 > DETECTABLE_CHI2,
         orthogonal_fraction=float((left / np.maximum(full, 1e-300)).max()),
         detection_limit=float(np.sqrt(DETECTABLE_CHI2) / strongest),
@@ -334,16 +397,18 @@ class ScoreTest:
                 values, gain = gram.solved([(first, i), (second, j)])
                 pair = (first, values[: len(i)]), (second, values[len(i) :])
                 count = sum(max(int(np.count_nonzero(v)), 1) + (len(s.candidate.probes) > 1) for s, v in pair)
-                if best is None or gain - price * count > best.nats:
-                    one, other = (
-                        CandidateStart(s.candidate.location, s.values(v), expected_gain=gain) for s, v in pair
-                    )
-                    best = PairScore((one, other), gain, gain - price * count, 0.0, 0.0)
+                if best is None or gain - price * count > best[0]:
+                    best = gain - price * count, gain, price * count, pair
         assert best
-        each = [alone[p] for p in best.locations]
+        _, gain, penalty, pair = best
+        starts = [CandidateStart(s.candidate.location, s.values(v), expected_gain=gain) for s, v in pair]
+        one, other = self.projected.limited(starts, [s.candidate.scaled for s, _ in pair])
+        gain = one.expected_gain
+        each = [alone[p] for p in (one.location, other.location)]
         better = max(0.0, *(s.nats for s in each))
         promised = sum(max(s.start.expected_gain, 0.0) for s in each)
-        return dataclasses.replace(best, more=best.nats - better, synergy=best.gain - promised)
+        more, synergy = gain - penalty - better, gain - promised
+        return PairScore((one, other), gain, gain - penalty, more, synergy)
 
 
 class _Shape(NamedTuple):

@@ -239,8 +239,10 @@ class SearchState:
         lines = self.error_lines(beside)
         if self.tests is None:
             self.tests = (
-                score_test(self.problem, beside.hypothesis, lines),
-                score_test(self.horizons.free_run.problem, beside.free_run.hypothesis, lines),
+                score_test(self.problem, beside.hypothesis, lines, self.is_plausible),
+                score_test(
+                    self.horizons.free_run.problem, beside.free_run.hypothesis, lines, self.is_plausible
+                ),
             )
         return self.tests
 
