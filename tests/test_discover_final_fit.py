@@ -16,12 +16,12 @@ import scipy.stats
 import rotflex_jax as rf
 from rotflex_jax.discover import conclusion
 from rotflex_jax.discover.final_fit import MOST_WORSE, log_error_ratio
-from rotflex_jax.discover.final_structure import FinalStructure
+from rotflex_jax.discover.final_structure import FinalStructure, FittedStructure
 from rotflex_jax.discover.result import RunErrors
 from rotflex_jax.discover.selection import choose
 from rotflex_jax.discover.supermodel import EffectLocation
 from rotflex_jax.discover.tables import FITTED_TO_ALL, error_lists, final_fit_sentence, parameter_rows
-from rotflex_jax.effects import Coulomb
+from rotflex_jax.effects import Coulomb, VoltageOffset
 from rotflex_jax.experiment import until_decided
 from rotflex_jax.fit.plausibility import Remark
 from rotflex_jax.parameters import Estimate
@@ -566,6 +566,43 @@ def test_friction_may_belong_to_each_run(arm):
     assert re.search(r"hub\.coulomb\.level 0\.0[23]\d*, 0\.1[12]\d* N m", final_fit_sentence(found))
     (row,) = [row for row in parameter_rows(found) if row.name == LEVEL]
     assert re.fullmatch(r"mean of runs with 0\.0[23]\d*, 0\.1[12]\d*", row.note)
+
+
+@pytest.mark.parametrize(
+    ("left", "preferred", "taken"), [(0.5, False, True), (2.9, False, False), (2.9, True, True)]
+)
+def test_a_large_offset_that_becomes_small_is_friction_of_the_run(left, preferred, taken, monkeypatch):
+    """Friction of its own is taken where every run prefers it, or where it takes the place of an offset."""
+    last = comparing([object(), object()])
+    last = dataclasses.replace(last, evaluation=SimpleNamespace(runs=SimpleNamespace(compared=True)))
+    monkeypatch.setattr(MODULE._FinalFitBuilder, "recordings", (object(), object()))
+    monkeypatch.setattr(MODULE._FinalFitBuilder, "searched", None)
+    monkeypatch.setattr(MODULE, "log_error_ratio", lambda a, b: 0.0)
+    monkeypatch.setattr(MODULE._FinalFitBuilder, "runs_prefer", lambda self, a, b, every: preferred)
+    last.state.say = lambda text: None
+    own = SimpleNamespace(fit="own", own_offsets=np.array([[0.2], [left]]))
+    monkeypatch.setattr(MODULE, "fit_structures", lambda asked: [own])
+    fitted = SimpleNamespace(
+        fit="shared",
+        structure=SimpleNamespace(friction=()),
+        own_offsets=np.array([[0.2], [3.0]]),
+        with_own_friction=lambda: SimpleNamespace(friction=(LEVEL,)),
+    )
+    candidate = MODULE._Candidate(cast(Any, SimpleNamespace(errors=None)), cast(Any, fitted))
+    assert last.with_own_friction(candidate).fitted is (own if taken else fitted)
+
+
+def test_offsets_of_runs_are_in_typical_sizes(arm):
+    """An offset has the typical size 0.05 V; friction of its own size in each run is no offset."""
+    local = {OFFSET: [0.1, -0.02], LEVEL: [0.03, 0.06]}
+    fit: Any = SimpleNamespace(
+        model=rf.Model(arm + Coulomb("hub") + VoltageOffset("input")),
+        local={n: [SimpleNamespace(value=v) for v in values] for n, values in local.items()},
+    )
+    structure: Any = SimpleNamespace(local=tuple(local), friction=(LEVEL,))
+    np.testing.assert_allclose(FittedStructure(structure, fit).own_offsets, [[2.0], [-0.4]])
+    structure.local = (LEVEL,)
+    assert FittedStructure(structure, fit).own_offsets.size == 0
 
 
 def test_friction_that_runs_share_stays_the_machine_s(arm):

@@ -18,7 +18,12 @@ from rotflex_jax.arena.simulator.records import make_record
 from rotflex_jax.discover import friction_of_runs
 from rotflex_jax.discover.checkpoint import kept, restored
 from rotflex_jax.discover.explanation import Explanation
-from rotflex_jax.discover.friction_of_runs import Refits, own_friction_notes, refit_with_own_friction
+from rotflex_jax.discover.friction_of_runs import (
+    Refits,
+    own_friction_notes,
+    refit_with_own_friction,
+    validated_with_own_friction,
+)
 from rotflex_jax.discover.hypothesis import (
     CandidateStart,
     Hypothesis,
@@ -31,10 +36,17 @@ from rotflex_jax.discover.hypothesis import (
 )
 from rotflex_jax.discover.likelihood import LikelihoodProblem, refit
 from rotflex_jax.discover.stepwise import calibration_notes, fit_baseline, refit_candidates
-from rotflex_jax.discover.supermodel import EffectLocation
+from rotflex_jax.discover.supermodel import EffectLocation, SuperModel
 from rotflex_jax.discover.tables import error_lists
-from rotflex_jax.discover.validation import Horizons, adapted_to_recordings, as_free_run, carried_over
+from rotflex_jax.discover.validation import (
+    Horizons,
+    ValidatedHypothesis,
+    adapted_to_recordings,
+    as_free_run,
+    carried_over,
+)
 from rotflex_jax.discover.verdict import Verdict
+from rotflex_jax.fit.dataset import prepare
 from rotflex_jax.models.model import Model
 from rotflex_jax.recording import Recording
 from rotflex_jax.report.figures.runs import _over_time
@@ -338,3 +350,69 @@ def test_a_large_difference_of_friction_is_one_in_each_run(first: float, second:
     )
     supermodel: Any = None
     assert friction_of_runs._differs_much(supermodel, found, [1, 2]) is much
+
+
+def validated_on(level: float, offset: float, one_way: bool) -> tuple[SuperModel, ValidatedHypothesis, Any]:
+    """Coulomb friction found in one run, validated on another run, without and with friction of its own.
+
+    Args:
+        level: Level of friction in the other run [N m].
+        offset: Offset of the voltage in the other run [V].
+        one_way: Whether the other run moves in one direction only.
+    """
+    train, t = runs_with(LEVELS[:1]), np.arange(1600) / 400.0
+    played = (1.5 * one_way) + 0.7 * np.sin(2 * np.pi * 1.3 * t) + 0.5 * np.sin(2 * np.pi * 0.4 * t)
+    hidden = {COULOMB: {"level": level}, EffectLocation("voltage_offset", "input"): {"offset": offset}}
+    made = make_record(hidden, seed=77, fs=400.0, perturb=0.0, played=played)
+    speed = made["state"][100:, 2]
+    assert one_way == bool(np.all(speed > 0))
+    model, data, s = Model(sp.baseline(), sp.SOLVER), sp.dataset(train), sp.supermodel_of(WANTED, train)
+    ports = ("hub", "joint")
+    problem = LikelihoodProblem.of(s, sp.SOLVER, data, ports)
+    other = prepare(model, sp.recordings((made,)), like=data)
+    horizons = Horizons.of(model, problem, LikelihoodProblem.of(s, sp.SOLVER, other, ports, (None,)), 1.0)
+    prediction, free = horizons.prediction.problem, horizons.free_run.problem
+    beside, start = fit_baseline(prediction), usual_start(s, COULOMB)
+    (runs,) = refit(free, [as_free_run(free, beside)])
+    (grown,), (run,) = refit_candidates(prediction, beside, [start]), refit_candidates(free, runs, [start])
+    found = dataclasses.replace(horizons.validated(grown, run), location=COULOMB)
+    return s, found, validated_with_own_friction(horizons, found)
+
+
+def of_run(s: SuperModel, found: ValidatedHypothesis, name: str) -> float:
+    """A parameter of the run by which a model was validated, fitted to free runs."""
+    assert found.free_run
+    return float(found.free_run.adapted.values(s)[0, s.mechanism.parameter_names.index(name)])
+
+
+OFFSET = "input.voltage_offset.offset"
+
+
+def test_a_large_offset_of_a_run_that_moves_one_way_stands_for_its_friction():
+    """The run does not determine how much of the torque is friction, so its level is not exact."""
+    s, found, own = validated_on(LEVELS[1], 0.0, one_way=True)
+    assert of_run(s, found, LEVEL) == pytest.approx(LEVELS[0], rel=0.1)
+    assert abs(of_run(s, found, OFFSET)) > 0.1
+    assert of_run(s, own, LEVEL) == pytest.approx(LEVELS[1], rel=0.25)
+    assert abs(of_run(s, own, OFFSET)) < 0.07
+
+
+def test_a_large_offset_of_a_run_that_reverses_is_an_offset():
+    s, found, own = validated_on(LEVELS[0], 0.2, one_way=False)
+    assert own is found
+    assert of_run(s, own, OFFSET) == pytest.approx(0.2, rel=0.1)
+    assert of_run(s, own, LEVEL) == pytest.approx(LEVELS[0], rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "stood"),
+    [(2.1, 1.0, True), (-2.1, 1.0, True), (1.9, 0.0, False), (2.1, -1.1, False)],
+)
+def test_an_offset_that_stands_for_friction_is_large_and_becomes_small(
+    before: float, after: float, stood: bool
+):
+    """It is beyond two typical sizes, in any run, and less than half of it is left in every run."""
+    offsets = np.array([[0.1, 0.0], [0.0, before]]), np.array([[after, 0.1], [0.0, 0.0]])
+    assert friction_of_runs.offset_stood_for_friction(*offsets) is stood
+    none = np.zeros((2, 0))
+    assert friction_of_runs.offset_stood_for_friction(none, none) is False

@@ -14,9 +14,9 @@ has left out. A run of which nothing is known gets the offsets that the fitted r
 Fitted first states hide much of the difference between two laws of friction; measured first states show it.
 A law that the search cannot exclude, or that contains the law found, replaces it if free runs from measured
 first states are clearly better with it. Each run gets friction of its own size if every run is clearly better
-with it. The offsets of a single run are left out if free runs are not clearly better with them. The same
-holds for every effect but the first: in predictions it may compensate, within a few samples, for what no
-candidate explains.
+with it, or if a large offset of a run then becomes small. The offsets of a single run are left out if free
+runs are not clearly better with them. The same holds for every effect but the first: in predictions it may
+compensate, within a few samples, for what no candidate explains.
 """
 
 import dataclasses
@@ -34,6 +34,7 @@ from rotflex_jax.discover.evaluation import (
     errors_with_own_calibration,
 )
 from rotflex_jax.discover.final_structure import FinalStructure, FittedStructure, fit_structures
+from rotflex_jax.discover.friction_of_runs import offset_stood_for_friction
 from rotflex_jax.discover.hypothesis import Hypothesis, with_all_calibrations
 from rotflex_jax.discover.in_place import laws_in_question
 from rotflex_jax.discover.likelihood import LikelihoodProblem, block_edges
@@ -338,7 +339,10 @@ class _FinalFitBuilder:
         return candidate
 
     def with_own_friction(self, candidate: _Candidate) -> _Candidate:
-        """The candidate with dry friction of its own size in each run, if every run is clearly better so."""
+        """The candidate with dry friction of its own size in each run.
+
+        It is taken if every run is clearly better so, or if a large offset of a run then becomes small.
+        """
         if log_error_ratio(candidate.tried.errors, self.searched) > MOST_WORSE:
             return candidate  # it would be refused for its errors
         structure = candidate.fitted.with_own_friction()
@@ -348,7 +352,8 @@ class _FinalFitBuilder:
             return candidate
         self.state.say("  with friction of its own size in each run")
         (fitted,) = fit_structures([(structure, self.recordings)])
-        if not self.runs_prefer(fitted.fit, candidate.fitted.fit, every=True):
+        better = self.runs_prefer(fitted.fit, candidate.fitted.fit, every=True)
+        if not (better or offset_stood_for_friction(candidate.fitted.own_offsets, fitted.own_offsets)):
             return candidate
         return candidate._replace(fitted=fitted)
 

@@ -165,6 +165,15 @@ class FittedStructure:
             return [self.as_hypothesis()]
         return [self.as_hypothesis(run) for run in runs]
 
+    @property
+    def own_offsets(self) -> Float[np.ndarray, "R K"]:
+        """Calibrations of each fitted recording, in typical sizes."""
+        m = self.fit.model.mechanism
+        specs = dict(zip(m.parameter_names, m.parameter_specifications, strict=True))
+        names = [n for n in self.structure.local if n not in self.structure.friction]
+        found = [[e.value / specs[n].typical for e in self.fit.local[n]] for n in names]
+        return np.array(found).T if found else np.zeros((0, 0))
+
     def own_values(self, count: int) -> Float[np.ndarray, "K L"]:
         """Unconstrained values of the local parameters of the search in each fitted recording."""
         s, m = self.structure.supermodel, self.fit.model.mechanism

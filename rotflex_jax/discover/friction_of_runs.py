@@ -2,6 +2,10 @@
 
 Friction changes with temperature, wear and load. One size for several runs may fit none of them, and friction
 would then be refused, whatever its law.
+
+Where a run moves mostly in one direction, an offset of its own does the same in it as friction of another
+size, and nothing is clearly better. But where the run reverses, the two differ, and offsets of drives are
+small. So a run has friction of its own size, too, if a large offset of the run then becomes small.
 """
 
 import dataclasses
@@ -22,6 +26,9 @@ from rotflex_jax.effects.base import DRY_FRICTION
 # In a poor model, friction of a validation run has a size of its own only if it differs by more than this
 # factor. What else the model lacks may make free runs better with a slightly larger or smaller friction.
 LARGE_DIFFERENCE = 1.75
+# An offset of a run is large beyond this many typical sizes (0.1 V). It stands for friction of another size
+# if it is smaller by this factor once the run has friction of its own.
+LARGE_OFFSET, OFFSET_LEFT = 2.0, 0.5
 
 
 class Refits(NamedTuple):
@@ -71,9 +78,10 @@ def validated_with_own_friction(
 ) -> ValidatedHypothesis:
     """A model of one training recording, with friction of its own size in validation runs of other runs.
 
-    It is the given model unless free runs over each of these validation recordings are clearly better so. In
-    a model that is still poor then, friction must differ by a large factor too. Several training recordings
-    show by themselves whether friction differs (`refit_with_own_friction`).
+    It is the given model unless free runs over each of these validation recordings are clearly better so, or
+    a large offset of one of them then becomes small. In a model that is still poor then, friction must differ
+    by a large factor too. Several training recordings show by themselves whether friction differs
+    (`refit_with_own_friction`).
 
     Args:
         horizons: Training and validation recordings at both horizons.
@@ -92,13 +100,33 @@ def validated_with_own_friction(
     tried = horizons.validated(own[0], own[1], near)
     assert tried.free_run
     counts = validation.problem.block_counts
+    better = _better_in_each(tried.free_run.blocks, found.free_run.blocks, counts, unknown)
+    offsets = (_own_offsets(s, v.free_run.adapted)[unknown] for v in (found, tried) if v.free_run)
     if (
         not all(is_physical(s, v.adapted, found.location) for v in (tried, tried.free_run))
-        or not _better_in_each(tried.free_run.blocks, found.free_run.blocks, counts, unknown)
+        or not (better or offset_stood_for_friction(*offsets))
         or (is_poor(tried, validation.problem.noise) and not _differs_much(s, tried.free_run, unknown))
     ):
         return found
     return dataclasses.replace(tried, location=found.location, parameter_count=found.parameter_count)
+
+
+def offset_stood_for_friction(before: Float[np.ndarray, "R K"], after: Float[np.ndarray, "R K"]) -> bool:
+    """Whether a large offset of a run becomes small if each run has friction of its own size.
+
+    Args:
+        before: Offsets of each run in typical sizes, in a model with one size of friction.
+        after: The same in a model with friction of its own size in each run.
+    """
+    most, left = (float(np.abs(offsets).max(initial=0.0)) for offsets in (before, after))
+    return most > LARGE_OFFSET and left < OFFSET_LEFT * most
+
+
+def _own_offsets(s: SuperModel, h: Hypothesis) -> Float[np.ndarray, "R K"]:
+    """Calibrations of each recording, in typical sizes."""
+    specs = s.mechanism.parameter_specifications
+    own = [i for i in s.local if i in h.local]
+    return h.values(s)[:, own] / np.array([specs[i].typical for i in own])
 
 
 def _differs_much(s: SuperModel, tried: ValidatedHypothesis, unknown: Sequence[int]) -> bool:
