@@ -92,8 +92,7 @@ class Fitted(NamedTuple):
     own: Refits
 
 
-def fitted(levels: tuple[float, float]) -> Fitted:
-    found = runs_with(levels)
+def fitted(found: tuple[Recording, ...]) -> Fitted:
     problem = sp.problem(found, sp.supermodel_of(WANTED, found))
     horizons = Horizons.of(Model(sp.baseline(), sp.SOLVER), problem, None, 1.0)
     prediction, free = horizons.prediction.problem, horizons.free_run.problem
@@ -106,7 +105,7 @@ def fitted(levels: tuple[float, float]) -> Fitted:
 
 @pytest.fixture(scope="module")
 def differ() -> Fitted:
-    return fitted(LEVELS)
+    return fitted(runs_with(LEVELS))
 
 
 def levels_of(problem: LikelihoodProblem, h: Hypothesis) -> np.ndarray:
@@ -123,7 +122,7 @@ def test_each_run_has_its_own_friction_where_the_runs_differ(differ: Fitted):
 
 
 def test_runs_that_agree_have_one_friction():
-    same = fitted((LEVELS[0], LEVELS[0]))
+    same = fitted(runs_with((LEVELS[0], LEVELS[0])))
     assert same.own.free_runs[0] is same.shared.free_runs[0]
     assert same.own.predictions[0] is same.shared.predictions[0]
 
@@ -352,25 +351,31 @@ def test_a_large_difference_of_friction_is_one_in_each_run(first: float, second:
     assert friction_of_runs._differs_much(supermodel, found, [1, 2]) is much
 
 
-def validated_on(level: float, offset: float, one_way: bool) -> tuple[SuperModel, ValidatedHypothesis, Any]:
-    """Coulomb friction found in one run, validated on another run, without and with friction of its own.
+def other_run(level: float, offset: float, one_way: bool) -> Recording:
+    """A run of the same machine.
 
     Args:
-        level: Level of friction in the other run [N m].
-        offset: Offset of the voltage in the other run [V].
-        one_way: Whether the other run moves in one direction only.
+        level: Level of Coulomb friction [N m].
+        offset: Offset of the voltage [V].
+        one_way: Whether the hub moves in one direction only.
     """
-    train, t = runs_with(LEVELS[:1]), np.arange(1600) / 400.0
+    t = np.arange(1600) / 400.0
     played = (1.5 * one_way) + 0.7 * np.sin(2 * np.pi * 1.3 * t) + 0.5 * np.sin(2 * np.pi * 0.4 * t)
     hidden = {COULOMB: {"level": level}, EffectLocation("voltage_offset", "input"): {"offset": offset}}
     made = make_record(hidden, seed=77, fs=400.0, perturb=0.0, played=played)
     speed = made["state"][100:, 2]
     assert one_way == bool(np.all(speed > 0))
+    return sp.recordings((made,))[0]
+
+
+def validated_on(other: Recording) -> tuple[SuperModel, ValidatedHypothesis, ValidatedHypothesis]:
+    """Coulomb friction found in one run, validated on another run, without and with friction of its own."""
+    train = runs_with(LEVELS[:1])
     model, data, s = Model(sp.baseline(), sp.SOLVER), sp.dataset(train), sp.supermodel_of(WANTED, train)
     ports = ("hub", "joint")
     problem = LikelihoodProblem.of(s, sp.SOLVER, data, ports)
-    other = prepare(model, sp.recordings((made,)), like=data)
-    horizons = Horizons.of(model, problem, LikelihoodProblem.of(s, sp.SOLVER, other, ports, (None,)), 1.0)
+    held_back = LikelihoodProblem.of(s, sp.SOLVER, prepare(model, [other], like=data), ports, (None,))
+    horizons = Horizons.of(model, problem, held_back, 1.0)
     prediction, free = horizons.prediction.problem, horizons.free_run.problem
     beside, start = fit_baseline(prediction), usual_start(s, COULOMB)
     (runs,) = refit(free, [as_free_run(free, beside)])
@@ -390,15 +395,26 @@ OFFSET = "input.voltage_offset.offset"
 
 def test_a_large_offset_of_a_run_that_moves_one_way_stands_for_its_friction():
     """The run does not determine how much of the torque is friction, so its level is not exact."""
-    s, found, own = validated_on(LEVELS[1], 0.0, one_way=True)
+    s, found, own = validated_on(other_run(LEVELS[1], 0.0, one_way=True))
     assert of_run(s, found, LEVEL) == pytest.approx(LEVELS[0], rel=0.1)
     assert abs(of_run(s, found, OFFSET)) > 0.1
     assert of_run(s, own, LEVEL) == pytest.approx(LEVELS[1], rel=0.25)
     assert abs(of_run(s, own, OFFSET)) < 0.07
 
 
+def test_a_large_offset_of_a_training_run_stands_for_its_friction_too():
+    runs = *runs_with(LEVELS[:1]), other_run(LEVELS[1], 0.0, one_way=True)
+    found = fitted(runs)
+    column = found.problem.supermodel.mechanism.parameter_names.index(OFFSET)
+    shared, own = (
+        refits.free_runs[0].values(found.problem.supermodel) for refits in (found.shared, found.own)
+    )
+    assert abs(shared[1, column]) > 0.1 and np.all(np.abs(own[:, column]) < 0.07)
+    np.testing.assert_allclose(levels_of(found.problem, found.own.free_runs[0]), LEVELS, rtol=0.25)
+
+
 def test_a_large_offset_of_a_run_that_reverses_is_an_offset():
-    s, found, own = validated_on(LEVELS[0], 0.2, one_way=False)
+    s, found, own = validated_on(other_run(LEVELS[0], 0.2, one_way=False))
     assert own is found
     assert of_run(s, own, OFFSET) == pytest.approx(0.2, rel=0.1)
     assert of_run(s, own, LEVEL) == pytest.approx(LEVELS[0], rel=0.1)

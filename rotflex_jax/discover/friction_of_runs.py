@@ -44,9 +44,10 @@ class Refits(NamedTuple):
 
 
 def refit_with_own_friction(horizons: Horizons, refits: Refits, starts: Sequence[CandidateStart]) -> Refits:
-    """Refits of friction repeated with a size for each recording, where all runs are clearly better so.
+    """Refits of friction repeated with a size for each recording.
 
-    A single run cannot show such a difference.
+    They are kept where all runs are clearly better so, or where a large offset of a run then becomes small. A
+    single run cannot show such a difference.
 
     Args:
         horizons: Training recordings at both horizons.
@@ -58,6 +59,7 @@ def refit_with_own_friction(horizons: Horizons, refits: Refits, starts: Sequence
         return refits
     s, kept = free_run.supermodel, Refits(list(refits.predictions), list(refits.free_runs))
     own = [with_own_friction(s, h, c.location) for h, c in zip(refits.free_runs, starts, strict=True)]
+    own = [_without_offsets(s, h) for h in own]  # or an offset would keep what it stands for
     asked = [k for k, h in enumerate(own) if h.sizes != refits.free_runs[k].sizes]
     fitted = refit(free_run, [own[k] for k in asked])
     fitted = refit_from_contained(free_run, fitted, [starts[k] for k in asked])
@@ -66,6 +68,7 @@ def refit_with_own_friction(horizons: Horizons, refits: Refits, starts: Sequence
         k: h
         for k, h in zip(asked, fitted, strict=True)
         if _better_in_each(h.blocks, refits.free_runs[k].blocks, counts, every)
+        or offset_stood_for_friction(*(_own_offsets(s, x) for x in (refits.free_runs[k], h)))
     }
     again = [with_own_friction(s, refits.predictions[k], starts[k].location) for k in taken]
     for (k, h), prediction_fit in zip(taken.items(), refit(prediction, again), strict=True):
@@ -127,6 +130,14 @@ def _own_offsets(s: SuperModel, h: Hypothesis) -> Float[np.ndarray, "R K"]:
     specs = s.mechanism.parameter_specifications
     own = [i for i in s.local if i in h.local]
     return h.values(s)[:, own] / np.array([specs[i].typical for i in own])
+
+
+def _without_offsets(s: SuperModel, h: Hypothesis) -> Hypothesis:
+    """A hypothesis with all calibrations of its recordings at zero."""
+    own = [h.local.index(i) for i in s.local if i in h.local]
+    local_z = h.local_z.copy()
+    local_z[:, own] = 0.0
+    return dataclasses.replace(h, local_z=local_z)
 
 
 def _differs_much(s: SuperModel, tried: ValidatedHypothesis, unknown: Sequence[int]) -> bool:
