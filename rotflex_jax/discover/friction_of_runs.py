@@ -58,8 +58,11 @@ def refit_with_own_friction(horizons: Horizons, refits: Refits, starts: Sequence
     if not free_run.several_runs:
         return refits
     s, kept = free_run.supermodel, Refits(list(refits.predictions), list(refits.free_runs))
-    own = [with_own_friction(s, h, c.location) for h, c in zip(refits.free_runs, starts, strict=True)]
-    own = [_without_offsets(s, h) for h in own]  # or an offset would keep what it stands for
+    # Offsets start at zero, or an offset would keep what it stands for.
+    own = [
+        _without_offsets(s, with_own_friction(s, h, c.location))
+        for h, c in zip(refits.free_runs, starts, strict=True)
+    ]
     asked = [k for k, h in enumerate(own) if h.sizes != refits.free_runs[k].sizes]
     fitted = refit(free_run, [own[k] for k in asked])
     fitted = refit_from_contained(free_run, fitted, [starts[k] for k in asked])
@@ -104,7 +107,7 @@ def validated_with_own_friction(
     assert tried.free_run
     counts = validation.problem.block_counts
     better = _better_in_each(tried.free_run.blocks, found.free_run.blocks, counts, unknown)
-    offsets = (_own_offsets(s, v.free_run.adapted)[unknown] for v in (found, tried) if v.free_run)
+    offsets = (_own_offsets(s, v.adapted)[unknown] for v in (found.free_run, tried.free_run))
     if (
         not all(is_physical(s, v.adapted, found.location) for v in (tried, tried.free_run))
         or not (better or offset_stood_for_friction(*offsets))
@@ -126,18 +129,20 @@ def offset_stood_for_friction(before: Float[np.ndarray, "R K"], after: Float[np.
 
 
 def _own_offsets(s: SuperModel, h: Hypothesis) -> Float[np.ndarray, "R K"]:
-    """Calibrations of each recording, in typical sizes."""
-    specs = s.mechanism.parameter_specifications
-    own = [i for i in s.local if i in h.local]
-    return h.values(s)[:, own] / np.array([specs[i].typical for i in own])
+    """Calibrations of each recording, which have no bounds: their coordinates are in typical sizes."""
+    return h.local_z[:, _calibrations(s, h)]
 
 
 def _without_offsets(s: SuperModel, h: Hypothesis) -> Hypothesis:
     """A hypothesis with all calibrations of its recordings at zero."""
-    own = [h.local.index(i) for i in s.local if i in h.local]
     local_z = h.local_z.copy()
-    local_z[:, own] = 0.0
+    local_z[:, _calibrations(s, h)] = 0.0
     return dataclasses.replace(h, local_z=local_z)
+
+
+def _calibrations(s: SuperModel, h: Hypothesis) -> list[int]:
+    """Columns of the local parameters that are calibrations."""
+    return [h.local.index(i) for i in s.local if i in h.local]
 
 
 def _differs_much(s: SuperModel, tried: ValidatedHypothesis, unknown: Sequence[int]) -> bool:

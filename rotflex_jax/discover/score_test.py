@@ -397,10 +397,11 @@ class ScoreTest:
                 values, gain = gram.solved([(first, i), (second, j)])
                 pair = (first, values[: len(i)]), (second, values[len(i) :])
                 count = sum(max(int(np.count_nonzero(v)), 1) + (len(s.candidate.probes) > 1) for s, v in pair)
-                if best is None or gain - price * count > best[0]:
-                    best = gain - price * count, gain, price * count, pair
+                penalty = price * count
+                if best is None or gain - penalty > best[0] - best[1]:
+                    best = gain, penalty, pair
         assert best
-        _, gain, penalty, pair = best
+        gain, penalty, pair = best
         starts = [CandidateStart(s.candidate.location, s.values(v), expected_gain=gain) for s, v in pair]
         one, other = self.projected.limited(starts, [s.candidate.scaled for s, _ in pair])
         gain = one.expected_gain

@@ -147,11 +147,11 @@ class SearchState:
             return "a parameter is outside its physical range"
         if self._needs_large_offset(h):
             return "an offset far beyond the usual cancels a part of it"
-        m = s.clean(h.mean_values(s), h.locations)
-        effect = m.effect(*location)
+        effect = s.effect(h.mean_values(s), location)
         if isinstance(effect, Sensing) and self.reach.position[effect.at] > effect.largest_reading():
             return "such a sensor could not read what was recorded"
-        return next((remark.sentence for remark in beyond_recordings(m, self.reach, [effect])), "")
+        remarks = beyond_recordings(s.mechanism, self.reach, [effect])
+        return next((remark.sentence for remark in remarks), "")
 
     def _needs_large_offset(self, h: Hypothesis) -> bool:
         """Whether an offset is far beyond its typical size, and over twice as large as in the present model.

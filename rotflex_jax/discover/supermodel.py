@@ -277,6 +277,12 @@ class SuperModel:
         """Index of an effect."""
         return [(e.name, e.at) for e in self.mechanism.effects].index(location)
 
+    def effect(self, values: Float[np.ndarray, " P"], location: EffectLocation) -> Effect:
+        """An effect with its parameters among the parameter values."""
+        effect = self.mechanism.effects[self.effect_index(location)]
+        own = values[self.parameter_indices(location)].tolist()
+        return effect.replace(**dict(zip(effect.values, own, strict=True)))
+
     def parameter_indices(self, location: EffectLocation) -> list[int]:
         """Indices of an effect's parameters in the parameter values."""
         head = location.name_prefix
