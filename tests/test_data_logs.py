@@ -484,6 +484,18 @@ def test_one_file_for_each_channel(tmp_path, header):
     exact(load(files))
 
 
+def test_times_of_the_files_may_have_their_unit_at_the_end_of_the_name(tmp_path):
+    files = channel_files(tmp_path / "run")
+    for file in files:
+        rows = np.loadtxt(file, delimiter=",", skiprows=1) * [1e3, 1.0]
+        np.savetxt(file, rows, "%.17g", ",", header=f"t_ms,{file.stem}", comments="")
+    found = load(files)
+    np.testing.assert_allclose(found.Ts, T[1] - T[0], rtol=1e-9)
+    assert [f.message for f in found.remarks if f.kind == "converted"] == [
+        "The time 't_ms' was converted from ms because of its name."
+    ]
+
+
 def test_another_table_in_the_folder_does_not_hide_the_names_of_the_files(tmp_path):
     channel_files(tmp_path / "run", "value")
     (tmp_path / "run" / "gains.csv").write_text("stage,gain\n1,2\n2,4\n")

@@ -618,6 +618,29 @@ def test_a_unit_at_the_end_of_a_name_in_capitals_is_read() -> None:
         rf.load(table, time="timeMs", outputs=("servoDeg", "armRad"), units={"theta": "rad"})
 
 
+def test_columns_are_found_by_names_that_end_with_a_unit(run, tmp_path) -> None:  # noqa: F811
+    alpha = RECORDING.y[:, 1]
+    plain = pd.DataFrame({"t_ms": 1e3 * T, "voltage_V": U, "theta_deg": np.rad2deg(THETA), "alphaRad": alpha})
+    found = rf.load(plain)
+    assert np.allclose(found.y, RECORDING.y) and found.Ts == pytest.approx(RECORDING.Ts)
+    assert [str(f) for f in found.remarks if f.kind == "converted"] == [
+        "Column 'theta_deg' was converted from degrees because of its name.",
+        "The time 't_ms' was converted from ms because of its name.",
+    ]
+    # The name itself comes first; two columns that differ in the unit alone leave it open which is meant.
+    exact = rf.load(plain.assign(theta=2.0 * THETA))
+    assert np.allclose(exact.y[:, 0], 2.0 * THETA)
+    with pytest.raises(InputError, match=r"has no column 'theta'; it has .*theta_deg, alphaRad, theta_rad"):
+        rf.load(plain.assign(theta_rad=THETA))
+    # Other ends of names are no units of the quantity, and counts have no size of their own.
+    for end in ("V", "counts", "ref", "mrad"):
+        with pytest.raises(InputError, match=rf"has no column 'theta'; it has .*theta_{end}"):
+            rf.load(plain.rename(columns={"theta_deg": f"theta_{end}"}))
+    plain[["t_ms", "voltage_V", "theta_deg"]].to_csv(tmp_path / "run.csv", index=False)
+    status, _, err = run("check", tmp_path / "run.csv")
+    assert status == 0 and "not read" not in err, err
+
+
 def test_a_model_in_radians_takes_no_recording_in_degrees() -> None:
     recording = rf.Recording(
         RECORDING.u, RECORDING.y, RECORDING.Ts, channels=RECORDING.channels, units=("deg", "rad")

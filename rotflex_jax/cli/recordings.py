@@ -144,7 +144,7 @@ class Columns:
 
         A note lists the other columns of the file, since one may be a sensor with another name.
         """
-        from rotflex_jax.data.columns import OTHER_NAMES
+        from rotflex_jax.data.columns import sensor_column
         from rotflex_jax.data.files import read_table
         from rotflex_jax.joints.rotary_flexible import SENSORS
 
@@ -155,7 +155,7 @@ class Columns:
             table = read_table(file)
         except (InputError, OSError):
             return None  # loading the file later reports the reason
-        column = {name: table.find(name, *OTHER_NAMES.get(name, ())) for name in ("t", *SENSORS)}
+        column = {name: sensor_column(table, name) for name in SENSORS}
         found = [c for c in SENSORS if column[c] in table.columns]
         if not found or (len(found) > 1 and "alpha" in found):
             return None
@@ -170,13 +170,13 @@ class Columns:
         Args:
             file: Name of the file.
             table: The columns of the file.
-            column: Name of a sensor, or `t` -> name of its column.
+            column: Name of a sensor -> name of its column.
             sensor: The sensor that is read.
         """
-        from rotflex_jax.data.columns import named_signals
+        from rotflex_jax.data.columns import clock_column, input_column, named_signals
 
         signals = named_signals(_signals(self.signals or (), ()), table).values()
-        named = map(table.find, (self.time or "t", self.input or "voltage"))
+        named = (clock_column(table, self.time), input_column(table, self.input))
         known = {*column.values(), *signals, *named, *table.clocks.values()}
         others = [c for c, values in table.columns.items() if c not in known and values.dtype.kind in "fiu"]
         if others:

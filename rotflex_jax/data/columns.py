@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Real
 
 from rotflex_jax.checks import real, shown
-from rotflex_jax.data.tables import Table, name_and_unit
+from rotflex_jax.data.tables import Table, name_and_unit, spaced
 from rotflex_jax.errors import InputError
 from rotflex_jax.recording.quality import SLOWEST_SAMPLING, Finding, is_absolute, whole_numbers
 from rotflex_jax.recording.samples import (
@@ -59,11 +59,26 @@ OTHER_UNITS = COUNT_UNITS | {
 """Lower-case units of outputs other than radians and degrees; other words in brackets are remarks."""
 
 
+def clock_column(table: Table, time: str | None = None) -> str:
+    """The column of the time: the one that the user names, or `t`; a unit may end its name, as in `t_ms`."""
+    return table.find(time or "t", *(() if time else OTHER_NAMES["t"]), units={*TIME_UNITS, *TIME_WORDS})
+
+
+def input_column(table: Table, name: str | None = None) -> str:
+    """The column of the input: the one that the user names, or `voltage`."""
+    return table.find("voltage" if name is None else name, units=INPUT_UNITS["V"])
+
+
+def sensor_column(table: Table, name: str) -> str:
+    """The column of an output; a unit of angles may end its name, as in `theta_deg`."""
+    return table.find(name, *OTHER_NAMES.get(name, ()), units=set().union(*ANGLE_UNITS.values()))
+
+
 def unused_sensors(table: Table, channels: Sequence[str], used: set[str]) -> list[Finding]:
     """Finding on further sensors of a joint in the file, if only one sensor is read."""
     if len(channels) != 1 or channels[0] not in JOINT_SENSORS:
         return []
-    there = {c: table.find(c, *OTHER_NAMES.get(c, ())) for c in JOINT_SENSORS}
+    there = {c: sensor_column(table, c) for c in JOINT_SENSORS}
     left = {c: name for c, name in there.items() if name in table.columns and name not in used}
     if not left:
         return []
@@ -157,12 +172,7 @@ def _words(table: Table, name: str) -> set[str]:
 
 
 def _split(text: str) -> set[str]:
-    return set(re.split(r"[^\w°]+|[\d_]+", _spaced(text).lower()))
-
-
-def _spaced(text: str) -> str:
-    """The text with a space before a word that begins with a capital letter, as in `thetaDeg`."""
-    return re.sub(r"(?<=[a-z]{2})(?=[A-Z][a-z])", " ", text)
+    return set(re.split(r"[^\w°]+|[\d_]+", spaced(text).lower()))
 
 
 def _as_written(table: Table, name: str, word: str) -> str:
@@ -172,7 +182,7 @@ def _as_written(table: Table, name: str, word: str) -> str:
 
 def _word_in(word: str, text: str) -> str:
     """A word in the spelling of the text; empty if the text does not have it."""
-    said = re.search(rf"(?<![^\W\d_]){re.escape(word)}(?![^\W\d_])", _spaced(text), re.I)
+    said = re.search(rf"(?<![^\W\d_]){re.escape(word)}(?![^\W\d_])", spaced(text), re.I)
     return said[0] if said else ""
 
 
@@ -375,7 +385,7 @@ def time_stamps(
             f"Argument `time_unit` must be one of {', '.join(TIME_UNITS)}, but is {time_unit!r}; give "
             "for instance time_unit='ms'."
         )
-    said, source = _time_unit(table, name, by_name=not any_unit)
+    said, source = time_unit_of(table, name, by_name=not any_unit)
     if time_unit is not None and said not in (None, time_unit):
         raise InputError(
             f"{table.label}: column {name!r} is in {said} by its {source}, but time_unit={time_unit!r} was "
@@ -397,9 +407,9 @@ def time_stamps(
     return t.astype(float) * TIME_UNITS[unit] if unit and unit != "s" else t.astype(float)
 
 
-def _time_unit(table: Table, name: str, by_name: bool) -> tuple[str | None, str]:
+def time_unit_of(table: Table, name: str, by_name: bool = True) -> tuple[str | None, str]:
     """Unit of a time by the unit in the file, or by the last word of the name; and where it is said."""
-    last = re.findall(r"[^\W\d_]+", _spaced(name_and_unit(name)[0]).lower())[-1:] if by_name else []
+    last = re.findall(r"[^\W\d_]+", spaced(name_and_unit(name)[0]).lower())[-1:] if by_name else []
     for word in (_unit(table, name).lower(), *last):
         unit = TIME_WORDS.get(word, word if word in TIME_UNITS else None)
         if unit is not None:
@@ -422,7 +432,7 @@ def conversions_by_name(table: Table, outputs: Mapping[str, str], clock: str) ->
         for channel, name in outputs.items()
         if not _unit(table, name) and _angle_unit(table, name)[0] == "deg"
     ]
-    unit = _time_unit(table, clock, by_name=True)[0] if clock and not _unit(table, clock) else None
+    unit = time_unit_of(table, clock)[0] if clock and not _unit(table, clock) else None
     if unit not in (None, "s"):
         message = f"The time {clock!r} was converted from {unit} because of its name."
         notes.append(Finding("converted", "time", message, "note"))

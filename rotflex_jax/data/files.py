@@ -19,16 +19,19 @@ from rotflex_jax.data.binary import (
     table_from_xlsx,
 )
 from rotflex_jax.data.columns import (
-    OTHER_NAMES,
+    clock_column,
     column_of,
     conversions_by_name,
     counts_per_turn,
     deflection,
+    input_column,
     input_unit,
     named_outputs,
     named_signals,
     output,
+    sensor_column,
     time_stamps,
+    time_unit_of,
     timing,
     unused_sensors,
 )
@@ -131,12 +134,12 @@ def _together(sources: Sequence[Any], label: str, max_bytes: int, time: str | No
     paths = [readable_file(source) for source in sources]
     tables = [read_table(path, max_bytes) for path in paths]
     clocks: dict[str, Any] = {}
-    units: set[str] = set()
+    names: dict[str, str] = {}  # unit of a time -> name of its column
     channels: list[Channel] = []
     alone: list[str | None] = []  # names of files with one channel
     file_of: dict[tuple[str, str], Path] = {}
     for path, table in zip(paths, tables, strict=True):
-        clock = table.find(time or "t", *(() if time else OTHER_NAMES["t"]))
+        clock = clock_column(table, time)
         own = [name for name in table.columns if name != clock]
         if not own:
             raise InputError(f"{table.label} has no column beside the time; export that channel again.")
@@ -145,7 +148,9 @@ def _together(sources: Sequence[Any], label: str, max_bytes: int, time: str | No
             t = real_numbers(
                 table.columns[clock], f"{table.label}: column {clock!r}", table.where, table.first
             )
-            units.add(name_and_unit(clock)[1] or table.units.get(clock, ""))
+            stated = name_and_unit(clock)[1] or table.units.get(clock, "")
+            unit = stated or time_unit_of(table, clock)[0] or ""
+            names[unit] = f"t [{unit}]" if stated else f"t_{unit}" if unit else "t"
             # Files with equal times share their clock.
             group = next((g for g, other in clocks.items() if np.array_equal(t, other)), group)
             clocks.setdefault(group, t)
@@ -158,15 +163,14 @@ def _together(sources: Sequence[Any], label: str, max_bytes: int, time: str | No
                 )
         channels += [Channel(group, name, table.units.get(name, ""), table.columns[name]) for name in own]
         alone += [path.stem] if len(own) == 1 else [None] * len(own)
-    if len(units) > 1:
-        named = " and ".join(repr(unit) for unit in sorted(units))
+    if len(names) > 1:
+        named = " and ".join(repr(unit) for unit in sorted(names))
         raise InputError(f"{label}: the times are in {named}, but must have one unit; export them alike.")
     if len({channel.name for channel in channels}) < len(channels):
         channels = [
             c if name is None else c._replace(name=name) for c, name in zip(channels, alone, strict=True)
         ]
-    unit = "".join(units)
-    return table_of_channels(label, channels, clocks, f"t [{unit}]" if unit else "t")
+    return table_of_channels(label, channels, clocks, next(iter(names.values()), "t"))
 
 
 def readable_file(source: Any) -> Path:
@@ -320,11 +324,8 @@ def load(
         names = list(outputs) if isinstance(outputs, Mapping) else outputs
         return from_foreign(source, names, units, Ts, accepted)
     table = read_table(source, sys.maxsize if "huge" in accepted else max_bytes, time)
-    u_name = table.find("voltage" if input is None else input)
-    chosen = {
-        channel: table.find(name, *OTHER_NAMES.get(name, ()))
-        for channel, name in named_outputs(outputs).items()
-    }
+    u_name = input_column(table, input)
+    chosen = {channel: sensor_column(table, name) for channel, name in named_outputs(outputs).items()}
     if u_name in chosen.values():
         raise InputError(
             f"{table.label}: the column {u_name!r} was given as input and as output, but it can be "
@@ -344,7 +345,7 @@ def load(
                 f"{table.label}: the column {name!r} was given as a signal and as input or output, but it "
                 "can be only one; correct signals=."
             )
-    clock = table.find(time or "t", *(() if time else OTHER_NAMES["t"]))
+    clock = clock_column(table, time)
     names = [u_name, *acting.values(), *chosen.values()]
     own = list(dict.fromkeys(clock for name, clock in table.clocks.items() if name in names))
     if own and clock not in table.columns:  # the file assigns times to each signal

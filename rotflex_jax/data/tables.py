@@ -4,7 +4,7 @@ import csv
 import json
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -42,25 +42,33 @@ class Table:
     objects: Mapping[str, str] = field(default_factory=dict)
     clocks: Mapping[str, str] = field(default_factory=dict)
 
-    def find(self, name: str, *others: str) -> str:
+    def find(self, name: str, *others: str, units: Collection[str] = ()) -> str:
         """The column with a name, where capital letters and a unit after the name do not matter.
 
         Args:
             name: name that is wanted.
             others: other names of the same column.
+            units: words in lower case that may end the name of the column without brackets, as in
+                `theta_deg`; used where no column has the name itself.
 
         Returns:
             The name of the column, or `name` if there is no such column, or more than one.
 
-        >>> table = Table("run.csv", {"Time [s]": np.zeros(1), "Theta (deg)": np.zeros(1)})
+        >>> names = ("Time [s]", "Theta (deg)", "alpha_deg")
+        >>> table = Table("run.csv", dict.fromkeys(names, np.zeros(1)))
         >>> table.find("theta"), table.find("t", "time"), table.find("alpha")
         ('Theta (deg)', 'Time [s]', 'alpha')
+        >>> table.find("alpha", units=("deg",))
+        'alpha_deg'
         """
         if not isinstance(name, str) or name in self.columns:
             return name
         wanted = {other.casefold() for other in (name, *others)}
         wanted |= {f"{other}.data" for other in wanted}  # column of a MATLAB timeseries
         like = [column for column in self.columns if name_and_unit(column)[0].casefold() in wanted]
+        if not like and units:
+            parts = {c: re.fullmatch(r"(.+)[_ .-]([^\W\d_]+)", spaced(c).casefold()) for c in self.columns}
+            like = [c for c, found in parts.items() if found and found[1] in wanted and found[2] in units]
         return like[0] if len(like) == 1 else name
 
     def column(self, name: str, what: str) -> Shaped[np.ndarray, " N"]:
@@ -113,6 +121,15 @@ class Table:
             cure = "save a timetable, timeseries or Dataset with -v7, and of others the arrays"
             then += f"; objects that only MATLAB reads are left out, {objects}: {cure}"
         return InputError(f"{self.label} has no {what}; it has {names or 'none'}: {then}.")
+
+
+def spaced(name: str) -> str:
+    """The name with a space before a word that begins with a capital letter.
+
+    >>> spaced("thetaDeg")
+    'theta Deg'
+    """
+    return re.sub(r"(?<=[a-z]{2})(?=[A-Z][a-z])", " ", name)
 
 
 MOST_LISTED = 60
