@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from rotflex_jax.adaptive import LMS
-from rotflex_jax.adaptive.objectives import values_at
+from rotflex_jax.adaptive.objectives import _values_on
 from rotflex_jax.adaptive.tuning import grid
 from rotflex_jax.basis import Delays, Volterra
 from rotflex_jax.recording import Recording
@@ -53,7 +53,7 @@ def main() -> None:
     sets = {str(n): jax.devices()[:n] for n in ((2, 8) if alone else (4,))}
     plain = sweep(jax.local_devices()[:1])
     spreads = {n: sweep(devices) for n, devices in sets.items()}
-    compiled = values_at._cache_size()
+    compiled = len(_values_on)
     again = {n: sweep(devices, 0.9) for n, devices in sets.items()}
     print(
         json.dumps(
@@ -61,7 +61,7 @@ def main() -> None:
                 "plain": plain,
                 "spread": spreads,
                 "where": {n: where(devices) for n, devices in sets.items()},
-                "compiled_again": values_at._cache_size() - compiled,
+                "compiled_again": len(_values_on) - compiled,
                 "changed": all(again[n] != spreads[n] for n in sets),
             }
         )

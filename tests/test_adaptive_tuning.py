@@ -8,7 +8,7 @@ import pytest
 from rotflex_jax.adaptive import LMS, RLS
 from rotflex_jax.adaptive.learning_curve import learning_curve
 from rotflex_jax.adaptive.moments import Moments, ar1_covariance
-from rotflex_jax.adaptive.objectives import RangeTransform, sample_moments, tuning_data, values_at
+from rotflex_jax.adaptive.objectives import RangeTransform, _values_on, sample_moments, tuning_data, values_at
 from rotflex_jax.adaptive.step_sizes import Margin, mean_square_bound
 from rotflex_jax.adaptive.tuning import grid, loss_and_slopes, tune
 from rotflex_jax.basis import Delays, Orthonormal, Volterra
@@ -101,10 +101,11 @@ def test_derivative_is_that_of_central_differences(
         data = tuning_data(BASIS, joint[:4], "alpha", objective)
         # These step sizes violate the margin, so that the penalty is active.
         guard = Margin(sample_moments(data.phi), 200.0) if guarded else None
-        options = {"curve": BOTH, "build": two_steps, "objective": objective}
         x, h = np.log([0.004, 4e-4]), 1e-5
         points = x + h * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]])
-        values, slopes = jax.device_get(loss_and_slopes(jnp.asarray(points), data, guard, **options))
+        values, slopes = jax.device_get(
+            loss_and_slopes(BOTH, two_steps, objective, jnp.asarray(points), data, guard)
+        )
     differences = (values[1::2] - values[2::2]) / (2 * h)
     np.testing.assert_allclose(slopes[0], differences, rtol=1e-4, atol=1e-6)
     assert np.min(np.abs(slopes[0])) > 1e-3
@@ -278,10 +279,10 @@ def test_other_values_compile_nothing_again(short: list[Recording]) -> None:
     assert len(traces) == first > 0
     with double_precision():
         data = tuning_data(BASIS, short, "alpha", "final")
-        compiled = values_at._cache_size()
+        compiled = len(_values_on)
         for mu in (0.01, 0.02):
             values_at(jnp.array([[mu, mu]]), data, names=("mu1", "mu2"), build=build, objective="final")
-        assert values_at._cache_size() == compiled + 1
+        assert len(_values_on) == compiled + 1
 
 
 def test_a_refused_step_is_cut_to_the_minimum_of_the_parabola() -> None:

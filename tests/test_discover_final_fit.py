@@ -21,7 +21,7 @@ from rotflex_jax.discover.result import RunErrors
 from rotflex_jax.discover.selection import choose
 from rotflex_jax.discover.supermodel import EffectLocation
 from rotflex_jax.discover.tables import FITTED_TO_ALL, error_lists, final_fit_sentence, parameter_rows
-from rotflex_jax.effects import Coulomb, VoltageOffset
+from rotflex_jax.effects import Coulomb, VoltageDrift, VoltageOffset
 from rotflex_jax.experiment import until_decided
 from rotflex_jax.fit.plausibility import Remark
 from rotflex_jax.parameters import Estimate
@@ -593,15 +593,17 @@ def test_a_large_offset_that_becomes_small_is_friction_of_the_run(left, preferre
 
 
 def test_offsets_of_runs_are_in_typical_sizes(arm):
-    """An offset has the typical size 0.05 V; friction of its own size in each run is no offset."""
-    local = {OFFSET: [0.1, -0.02], LEVEL: [0.03, 0.06]}
+    """The typical size is 0.05 V. Friction of its own size in each run is no offset, nor is a drift."""
+    mechanism = arm + Coulomb("hub") + VoltageOffset("input") + VoltageDrift("input")
+    drift = next(n for n in mechanism.parameter_names if "voltage_drift" in n)
+    local = {OFFSET: [0.1, -0.02], LEVEL: [0.03, 0.06], drift: [9.0, 9.0]}
     fit: Any = SimpleNamespace(
-        model=rf.Model(arm + Coulomb("hub") + VoltageOffset("input")),
-        local={n: [SimpleNamespace(value=v) for v in values] for n, values in local.items()},
+        local={n: [SimpleNamespace(value=v) for v in values] for n, values in local.items()}
     )
-    structure: Any = SimpleNamespace(local=tuple(local), friction=(LEVEL,))
+    calibrations = [mechanism.parameter_names.index(OFFSET)]
+    structure: Any = SimpleNamespace(supermodel=SimpleNamespace(mechanism=mechanism, local=calibrations))
     np.testing.assert_allclose(FittedStructure(structure, fit).own_offsets, [[2.0], [-0.4]])
-    structure.local = (LEVEL,)
+    del fit.local[OFFSET]
     assert FittedStructure(structure, fit).own_offsets.size == 0
 
 

@@ -14,14 +14,18 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pooch
 import pytest
+import scipy
 from jax.experimental import serialize_executable
 
 import rotflex_jax as rf
+from rotflex_jax.basis import Delays, Orthonormal, Volterra
+from rotflex_jax.basis.bank import Bank, Traced
 from rotflex_jax.effects import Coulomb, LuGre
 from rotflex_jax.effects.base import Force
 from rotflex_jax.mechanism import Exponential
@@ -483,6 +487,78 @@ class Own(Force):
 
 def test_nothing_is_kept_of_a_law_from_elsewhere() -> None:
     assert not static_key((rf.joints.paper() + Own(at="hub")).structure)
+
+
+class Doubled(Bank):
+    """A bank of a user: its law is not in the source of this package."""
+
+    factor: float = eqx.field(static=True)
+    size = property(lambda self: 1)
+    names = property(lambda self: ("twice",))
+    reach = property(lambda self: 1)
+
+    def respond(self, u: jax.Array) -> jax.Array:
+        return self.factor * u[:, None]
+
+
+def test_the_structure_of_an_argument_is_part_of_its_program(folder: Path) -> None:
+    u = np.random.default_rng(0).normal(size=20)
+    bases = [Delays(3), Delays(3, first=1), Volterra(Delays(3), 1), Volterra(Delays(3), 2)]
+    bases += [Orthonormal((0.5,)), Orthonormal((0.5, 0.4))]
+
+    def respond(part: Traced, u: jax.Array) -> jax.Array:
+        return part.respond(u)
+
+    with double_precision():
+        for _ in range(2):  # from the source, then from disk
+            program = PersistentJit(respond, static=0)
+            for basis in bases:
+                np.testing.assert_allclose(program(basis, u), basis.respond(jnp.asarray(u)), atol=1e-12)
+            assert len(files(folder)) == len(program) == len(bases)
+        # Only numbers differ, so that the program is the same.
+        np.testing.assert_allclose(program(Orthonormal((0.7,)), u)[:, 0], 0.51**0.5 * ar(0.7, u), atol=1e-12)
+        assert len(program) == len(bases)
+        for bank in (Doubled(2.0), Volterra(Doubled(3.0), 1)):
+            np.testing.assert_allclose(program(bank, u)[:, -1], (2.0 + isinstance(bank, Volterra)) * u)
+        assert len(program) == len(bases) + 2 and len(files(folder)) == len(bases)
+
+
+def ar(a: float, u: np.ndarray) -> np.ndarray:
+    """y[t] = a y[t-1] + u[t-1]"""
+    return scipy.signal.lfilter([0.0, 1.0], [1.0, -a], u)
+
+
+SERIES = """
+import json, sys
+import numpy as np
+import rotflex_jax as rf
+from rotflex_jax.basis import optimise_poles
+from rotflex_jax.runtime import persistent_jit
+persistent_jit._LOADED += 3600.0
+rf.keep_programs(sys.argv[1])
+rng = np.random.default_rng(1)
+u = rng.normal(size=(2, 400))
+y = np.stack([np.cumsum(0.1 * u, axis=1), u], axis=2)
+recordings = [rf.Recording(u=a, y=b, Ts=0.002) for a, b in zip(u, y)]
+methods = ["volterra_lms", "volterra_lms_gradient", "volterra_kalman"]
+found = rf.compare(recordings, methods, window_seconds=0.05)
+bank, _ = optimise_poles(u[0], y[0, :, 0], [0.5], starts=1)
+counts = persistent_jit.program_counts()
+errors = {r.method: r.rmse for r in found.rows}
+print(json.dumps([errors, bank.poles[0].real, counts.compiled, counts.loaded]))
+"""
+
+
+def test_a_comparison_of_series_in_a_second_process_compiles_nothing(tmp_path: Path) -> None:
+    found = []
+    for _ in range(2):
+        run = subprocess.run(
+            [sys.executable, "-c", SERIES, str(tmp_path)], capture_output=True, text=True, check=True
+        )
+        found.append(json.loads(run.stdout.splitlines()[-1]))
+    (*first, made, none), (*second, again, loaded) = found
+    assert first == second and len(first[0]) == 3
+    assert none == again == 0 and loaded == made > 8
 
 
 SECOND = """

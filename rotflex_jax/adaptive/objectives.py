@@ -30,6 +30,7 @@ from rotflex_jax.errors import InputError
 from rotflex_jax.recording import Recording
 from rotflex_jax.recording.recording import listed
 from rotflex_jax.recording.samples import of_one_period
+from rotflex_jax.runtime.persistent_jit import persistent_jit
 from rotflex_jax.runtime.xla import double_precision, spread
 
 FilterBuilder = Callable[[dict[str, Any]], AdaptiveFilter | tuple[AdaptiveFilter, Basis]]
@@ -369,7 +370,6 @@ MOMENT_SAMPLES = 20_000
 """Most samples of which the moments for this are means."""
 
 
-@functools.partial(jax.jit, static_argnames=("names", "build", "objective", "mesh"))
 def values_at(
     points: Float[Array, "K n"],
     data: TuningData,
@@ -380,6 +380,20 @@ def values_at(
     mesh: Mesh | None = None,
 ) -> Float[Array, " K"]:
     """The objective at many points, on each device some at a time; compiled once per `build`."""
+    # A program on disk is for one device.
+    run = _values_on if mesh is None else _values_on.jitted
+    return run(names, build, objective, mesh, points, data)
+
+
+@persistent_jit(static=4)
+def _values_on(
+    names: tuple[str, ...],
+    build: FilterBuilder,
+    objective: Objective,
+    mesh: Mesh | None,
+    points: Float[Array, "K n"],
+    data: TuningData,
+) -> Float[Array, " K"]:
     values = functools.partial(_values, names=names, build=build, objective=objective)
     return spread(values, mesh)(points, data)
 

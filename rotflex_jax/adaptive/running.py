@@ -19,6 +19,7 @@ from rotflex_jax.errors import InputError
 from rotflex_jax.models.series import Series
 from rotflex_jax.recording import Recording
 from rotflex_jax.recording.recording import single
+from rotflex_jax.runtime.persistent_jit import persistent_jit
 from rotflex_jax.runtime.xla import working_precision
 
 # An a-priori error beyond this multiple of the largest output means divergence.
@@ -147,21 +148,21 @@ def _run_on(
         real = jnp.finfo(phi.dtype).dtype
         filter = jax.tree.map(lambda leaf: np.asarray(leaf).astype(real), filter)
         start = None if state is None else _resumed(filter, size, phi.dtype, state)
-        result = _run(filter, lags, phi, y, start, form, every)
+        result = _run(form, every, filter, lags, phi, y, start)
         end, errors, path, weights = jax.device_get(result)
     errors, status = _divergence(errors, y)
     return Run(errors, weights, path, np.arange(len(path)) * every, end, status)
 
 
-@functools.partial(jax.jit, static_argnums=(5, 6))
+@persistent_jit(static=2)
 def _run(
+    form: RegressorsInLoop | None,
+    every: int,
     filter: AdaptiveFilter,
     lags: Inexact[Array, " M"] | None,
     phi: Inexact[Array, "N *P"],
     y: Inexact[Array, " N"],
     state: Any,
-    form: RegressorsInLoop | None,
-    every: int,
 ) -> tuple[Any, Inexact[Array, " N"], Inexact[Array, "K p"], Inexact[Array, " p"]]:
     size = regressor_size(phi) if form is None else form.size
     state = filter.init(size, phi.dtype) if state is None else state

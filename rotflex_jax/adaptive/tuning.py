@@ -1,6 +1,5 @@
 """Search for settings of a filter: on a grid, or by the gradient through the filter's loop."""
 
-import functools
 import itertools
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -33,6 +32,7 @@ from rotflex_jax.basis import Basis
 from rotflex_jax.errors import InputError
 from rotflex_jax.optimise.quasi_newton import Values, descend
 from rotflex_jax.recording import Recording
+from rotflex_jax.runtime.persistent_jit import persistent_jit
 from rotflex_jax.runtime.xla import double_precision, mesh_of
 
 
@@ -166,11 +166,7 @@ def tune(
         guard = _guard(margin, data, *build_filter(build, starts[0])) if margin else None
 
         def values(points: Float[np.ndarray, "S n"]) -> Values:
-            return jax.device_get(
-                loss_and_slopes(
-                    jnp.asarray(points), data, guard, curve=curve, build=build, objective=objective
-                )
-            )
+            return jax.device_get(loss_and_slopes(curve, build, objective, jnp.asarray(points), data, guard))
 
         found = descend(values, first, evaluations)
         paths = tuple(
@@ -208,15 +204,14 @@ def tune(
     )
 
 
-@functools.partial(jax.jit, static_argnames=("curve", "build", "objective"))
+@persistent_jit(static=3)
 def loss_and_slopes(
-    points: Float[Array, "S n"],
-    data: TuningData,
-    guard: Margin | None = None,
-    *,
     curve: RangeTransform,
     build: FilterBuilder,
     objective: Objective,
+    points: Float[Array, "S n"],
+    data: TuningData,
+    guard: Margin | None,
 ) -> tuple[Float[Array, " S"], Float[Array, "S n"]]:
     """Logarithm of the objective, and its derivatives with respect to the unconstrained coordinates.
 

@@ -9,13 +9,13 @@ from collections.abc import Mapping
 from typing import Any, Protocol, runtime_checkable
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
 from rotflex_jax.checks import signal, whole
 from rotflex_jax.errors import InputError
+from rotflex_jax.runtime.persistent_jit import persistent_jit
 from rotflex_jax.runtime.xla import working_precision
 
 
@@ -95,7 +95,9 @@ class Basis(Traced, Protocol):
         ...
 
 
-_respond = jax.jit(lambda part, u: part.respond(u))
+@persistent_jit(static=0)
+def _respond(part: Traced, u: Float[Array, " N"]) -> Float[Array, "N P"]:
+    return part.respond(u)
 
 
 def evaluate(part: Traced, u: Any) -> Float[np.ndarray, "N P"]:

@@ -18,6 +18,7 @@ from rotflex_jax.basis.orthonormal import Orthonormal, SectionKinds, coordinates
 from rotflex_jax.basis.volterra import Volterra
 from rotflex_jax.checks import seed as checked_seed, signal, whole
 from rotflex_jax.errors import InputError
+from rotflex_jax.runtime.persistent_jit import persistent_jit
 from rotflex_jax.runtime.xla import double_precision
 
 
@@ -270,8 +271,14 @@ class _Residual:
         return y - Q @ (Q.T @ y)
 
 
-_left = jax.jit(lambda residual, z, args: residual(z, args), static_argnums=0)
-_slopes = jax.jit(lambda residual, z, args: jax.jacfwd(residual)(z, args), static_argnums=0)
+@persistent_jit(static=1)
+def _left(residual: _Residual, z: Float[Array, " M"], args: Any) -> Float[Array, " RN"]:
+    return residual(z, args)
+
+
+@persistent_jit(static=1)
+def _slopes(residual: _Residual, z: Float[Array, " M"], args: Any) -> Float[Array, "RN M"]:
+    return jax.jacfwd(residual)(z, args)
 
 
 def _descend(residual: _Residual, z: Float[np.ndarray, " M"], args: Any, most: int) -> PoleStart:
@@ -282,7 +289,7 @@ def _descend(residual: _Residual, z: Float[np.ndarray, " M"], args: Any, most: i
             end = scipy.optimize.least_squares(
                 lambda z: np.asarray(_left(residual, jnp.asarray(z), args)),
                 z,
-                lambda z: np.asarray(_slopes(residual, jnp.asarray(z), args)),  # pyright: ignore[reportArgumentType]
+                lambda z: np.asarray(_slopes(residual, jnp.asarray(z), args)),
                 method="lm",
                 ftol=1e-12,
                 xtol=1e-9,

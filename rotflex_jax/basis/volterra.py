@@ -35,6 +35,19 @@ def indices(size: int, degree: int, layout: str) -> tuple[Index, ...]:
     return tuple(itertools.combinations_with_replacement(range(size), degree))
 
 
+@cache
+def factors(size: int, degree: int, layout: str) -> Int[np.ndarray, "P d"]:
+    """The products of `indices` as an array that cannot be written to: column k has the factor k of each.
+
+    >>> factors(2, 2, "triangular").tolist()
+    [[0, 0], [0, 1], [1, 1]]
+    """
+    listed = indices(size, degree, layout)
+    found = np.array(listed, int).reshape(len(listed), degree)
+    found.flags.writeable = False
+    return found
+
+
 def orders(index: Index) -> int:
     """Number of orders in which the factors of a product can be written.
 
@@ -281,11 +294,10 @@ class Volterra(eqx.Module):
         """Regressors for outputs of the bank."""
         columns = []
         for d in self.chosen:
-            listed = indices(self.bank.size, d, self.layout)
-            factors = np.array(listed, int).reshape(len(listed), d)
-            product = jnp.ones((len(z), len(listed)), z.dtype)
+            picked = factors(self.bank.size, d, self.layout)
+            product = jnp.ones((len(z), len(picked)), z.dtype)
             for k in range(d):
-                product = product * z[:, factors[:, k]] if k else z[:, factors[:, 0]]
+                product = product * z[:, picked[:, k]] if k else z[:, picked[:, 0]]
             columns.append(product)
         return jnp.concatenate(columns, axis=1)
 

@@ -116,7 +116,9 @@ class AdaptiveSeries:
     ) -> tuple[str, AdaptiveFilter]:
         """Settings in words and filter with the least error of its last weights on the other halves."""
         P, rule = basis.size, self.rule
-        build = FilterFactory(rule, tuple((basis.degrees > 1).tolist()), noise)
+        # Of the filters, only Kalman's has the noise; the others are the same program for any noise.
+        known = float(noise) if rule == "kalman" else 0.0
+        build = FilterFactory(rule, tuple((basis.degrees > 1).tolist()), known)
         axes: dict[str, Any] = {
             "lms": {"mu": np.logspace(-3.5, -0.3, 7) / P, "mu_products": np.logspace(-3.5, -0.3, 7) / P},
             "nlms": {"mu": np.logspace(-3.5, 0, 10)},

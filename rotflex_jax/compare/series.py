@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from rotflex_jax.basis import Orthonormal, Volterra
 from rotflex_jax.basis.bank import Averages, Bank
+from rotflex_jax.basis.volterra import factors
 from rotflex_jax.checks import Progress
 from rotflex_jax.compare.linear_models import chosen_system, refined
 from rotflex_jax.compare.method import Fitted, require_one_sampling_period
@@ -181,10 +182,10 @@ def monomials(basis: Volterra, z: Float[np.ndarray, "N M"]) -> Float[np.ndarray,
         if degree == 0:
             columns.append(np.ones((len(z), 1)))
             continue
-        factors = np.array([i for i in basis.indices if len(i) == degree], int)
-        product = z[:, factors[:, 0]]
-        for f in factors.T[1:]:
-            product = product * z[:, f]
+        picked = factors(basis.bank.size, degree, basis.layout)
+        product = z[:, picked[:, 0]]
+        for column in picked.T[1:]:
+            product = product * z[:, column]
         columns.append(product)
     return np.concatenate(columns, axis=1)
 

@@ -168,10 +168,9 @@ class FittedStructure:
     @property
     def own_offsets(self) -> Float[np.ndarray, "R K"]:
         """Calibrations of each fitted recording, in typical sizes."""
-        m = self.fit.model.mechanism
-        specs = dict(zip(m.parameter_names, m.parameter_specifications, strict=True))
-        names = [n for n in self.structure.local if n not in self.structure.friction]
-        found = [[e.value / specs[n].typical for e in self.fit.local[n]] for n in names]
+        s, local = self.structure.supermodel, self.fit.local
+        names, specs = s.mechanism.parameter_names, s.mechanism.parameter_specifications
+        found = [[e.value / specs[i].typical for e in local[names[i]]] for i in s.local if names[i] in local]
         return np.array(found).T if found else np.zeros((0, 0))
 
     def own_values(self, count: int) -> Float[np.ndarray, "K L"]:

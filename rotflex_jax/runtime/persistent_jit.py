@@ -196,10 +196,10 @@ class PersistentJit:
 
     def _file(self, known: tuple[Any, ...], tree: Any, kinds: Any, settings: Any) -> Path | None:
         """The file of the program for these arguments; None if it is not kept on disk."""
-        texts, folder = [static_key(x) for x in known], programs_folder()
+        texts, folder = [*map(static_key, known), _tree_key(tree)], programs_folder()
         if folder is None or not all(texts) or not _unchanged():
             return None
-        name = f"{self._name}{texts}{tree}{kinds}{settings}"
+        name = f"{self._name}{texts}{kinds}{settings}"
         return folder / _surroundings() / hashlib.sha256(name.encode()).hexdigest()
 
     def __len__(self) -> int:
@@ -534,6 +534,20 @@ def _parts(value: Any) -> Iterator[str | None]:
         yield from _parts(tuple(getattr(value, f.name) for f in dataclasses.fields(value)))
     else:  # an object without attributes is identified by its class
         yield None if getattr(value, "__dict__", True) else f"{kind.__module__}.{kind.__qualname__}"
+
+
+def _tree_key(tree: Any) -> str:
+    """A text that identifies the structure of arguments; empty if a class in it is not of this package."""
+    node = tree.node_data()
+    if node is None:
+        return "*"
+    kind, fields = node
+    said, parts = repr(fields), [_tree_key(part) for part in tree.children()]
+    known = kind in (tuple, list, dict, type(None)) or kind.__module__.startswith(f"{_PACKAGE}.")
+    # The text of an array may be shortened, and the text of a function does not say what the function does.
+    if not known or "array(" in said or "<" in said or not all(parts):
+        return ""
+    return f"{kind.__module__}.{kind.__qualname__}{said}({','.join(parts)})"
 
 
 def _plain() -> bool:
