@@ -101,11 +101,10 @@ def test_derivative_is_that_of_central_differences(
         data = tuning_data(BASIS, joint[:4], "alpha", objective)
         # These step sizes violate the margin, so that the penalty is active.
         guard = Margin(sample_moments(data.phi), 200.0) if guarded else None
+        options = {"curve": BOTH, "build": two_steps, "objective": objective}
         x, h = np.log([0.004, 4e-4]), 1e-5
         points = x + h * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]])
-        values, slopes = jax.device_get(
-            loss_and_slopes(BOTH, two_steps, objective, jnp.asarray(points), data, guard)
-        )
+        values, slopes = jax.device_get(loss_and_slopes(jnp.asarray(points), data, guard, **options))
     differences = (values[1::2] - values[2::2]) / (2 * h)
     np.testing.assert_allclose(slopes[0], differences, rtol=1e-4, atol=1e-6)
     assert np.min(np.abs(slopes[0])) > 1e-3
@@ -283,6 +282,23 @@ def test_other_values_compile_nothing_again(short: list[Recording]) -> None:
         for mu in (0.01, 0.02):
             values_at(jnp.array([[mu, mu]]), data, names=("mu1", "mu2"), build=build, objective="final")
         assert len(_values_on) == compiled + 1
+
+
+def test_a_function_that_makes_the_filter_may_hold_traced_values(joint) -> None:
+    """The derivative by a factor in `build` is that by the setting, whose chain rule is 1 to 0.01."""
+    short = [r.slice(0, 300) for r in joint[:2]]
+    with double_precision():
+        data = tuning_data(BASIS, short, "alpha", "mean_error")
+
+        def error(a: jax.Array, point: float) -> jax.Array:
+            build = lambda s: LMS(s["mu"] * a)  # noqa: E731
+            return values_at(jnp.array([[point]]), data, names=("mu",), build=build, objective="mean_error")[
+                0
+            ]
+
+        slope, h = float(jax.grad(error)(jnp.asarray(1.0), 0.01)), 1e-5
+        difference = float(error(jnp.asarray(1.0), 0.01 + h) - error(jnp.asarray(1.0), 0.01 - h)) / (2 * h)
+    assert slope == pytest.approx(0.01 * difference, rel=1e-4) and abs(slope) > 1e-4
 
 
 def test_a_refused_step_is_cut_to_the_minimum_of_the_parabola() -> None:

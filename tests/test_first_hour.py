@@ -632,6 +632,14 @@ def test_columns_are_found_by_names_that_end_with_a_unit(run, tmp_path) -> None:
     assert np.allclose(exact.y[:, 0], 2.0 * THETA)
     with pytest.raises(InputError, match=r"has no column 'theta'; it has .*theta_deg, alphaRad, theta_rad"):
         rf.load(plain.assign(theta_rad=THETA))
+    for rival in ("theta_counts", "theta_mm", "theta_V"):
+        with pytest.raises(InputError, match="has no column 'theta'; it has"):
+            rf.load(plain.assign(**{rival: THETA}))
+    # With a given period or accepted units the end of a name does not make a column the time.
+    steady = rf.load(plain.rename(columns={"t_ms": "t_s"}).assign(t_s=RECORDING.Ts), Ts=RECORDING.Ts)
+    assert np.allclose(steady.y, RECORDING.y)
+    with pytest.raises(InputError, match="has no column 't'"):
+        rf.load(plain, accept=("units",))
     # Other ends of names are no units of the quantity, and counts have no size of their own.
     for end in ("V", "counts", "ref", "mrad"):
         with pytest.raises(InputError, match=rf"has no column 'theta'; it has .*theta_{end}"):

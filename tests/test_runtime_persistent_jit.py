@@ -521,6 +521,32 @@ def test_the_structure_of_an_argument_is_part_of_its_program(folder: Path) -> No
         for bank in (Doubled(2.0), Volterra(Doubled(3.0), 1)):
             np.testing.assert_allclose(program(bank, u)[:, -1], (2.0 + isinstance(bank, Volterra)) * u)
         assert len(program) == len(bases) + 2 and len(files(folder)) == len(bases)
+    tree = jax.tree.structure({Rule(1): 0.0})
+    assert "Rule" in str(tree) and not persistent_jit._tree_key(tree)
+
+
+@dataclasses.dataclass(frozen=True, order=True)
+class Rule:
+    """A static value of a user."""
+
+    a: int
+
+
+DEVICES = """
+import jax
+jax.config.update("jax_num_cpu_devices", 2)
+import numpy as np
+import rotflex_jax as rf
+from rotflex_jax.basis import Orthonormal
+u, bank = np.arange(4.0), Orthonormal((0.5,))
+on = [bank.with_parameters(jax.device_put(bank.parameters, d)).outputs(u) for d in jax.devices()]
+print(len(on), np.array_equal(*on))
+"""
+
+
+def test_arrays_on_another_device_run_there() -> None:
+    done = subprocess.run([sys.executable, "-c", DEVICES], capture_output=True, text=True, check=False)
+    assert done.stdout.strip() == "2 True", done.stderr
 
 
 def ar(a: float, u: np.ndarray) -> np.ndarray:

@@ -116,7 +116,9 @@ def largest_difference(train: list[Recording], objective: str) -> float:
     points = np.array([x, *(x + s * h * np.eye(2)[k] for k in range(2) for s in (1, -1))])
     with double_precision():
         data = tuning_data(BASIS, train, "alpha", objective)
-        values, slopes = loss_and_slopes(curve, build, objective, jnp.asarray(points), data, None)
+        values, slopes = loss_and_slopes(
+            jnp.asarray(points), data, curve=curve, build=build, objective=objective
+        )
     values, slopes = np.asarray(values), np.asarray(slopes)[0]
     differences = (values[1::2] - values[2::2]) / (2 * h)
     return float(np.max(np.abs(slopes - differences)) / np.max(np.abs(differences)))

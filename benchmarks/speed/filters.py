@@ -120,7 +120,7 @@ def pairs_cases(N: int) -> list[Case]:
 
     def slopes() -> None:
         with double_precision():
-            found = loss_and_slopes(curve, _build(5), "mean_error", point, data, None)
+            found = loss_and_slopes(point, data, curve=curve, build=_build(5), objective="mean_error")
             jax.block_until_ready(found)
 
     def value() -> None:

@@ -21,6 +21,7 @@ from rotflex_jax.adaptive.objectives import (
     TuningPath,
     build_filter,
     evaluate,
+    found_again,
     sample_moments,
     starting_sets,
     tuning_data,
@@ -166,7 +167,11 @@ def tune(
         guard = _guard(margin, data, *build_filter(build, starts[0])) if margin else None
 
         def values(points: Float[np.ndarray, "S n"]) -> Values:
-            return jax.device_get(loss_and_slopes(curve, build, objective, jnp.asarray(points), data, guard))
+            return jax.device_get(
+                loss_and_slopes(
+                    jnp.asarray(points), data, guard, curve=curve, build=build, objective=objective
+                )
+            )
 
         found = descend(values, first, evaluations)
         paths = tuple(
@@ -204,8 +209,26 @@ def tune(
     )
 
 
-@persistent_jit(static=3)
 def loss_and_slopes(
+    points: Float[Array, "S n"],
+    data: TuningData,
+    guard: Margin | None = None,
+    *,
+    curve: RangeTransform,
+    build: FilterBuilder,
+    objective: Objective,
+) -> tuple[Float[Array, " S"], Float[Array, "S n"]]:
+    """Logarithm of the objective, and its derivatives with respect to the unconstrained coordinates.
+
+    In forward mode there are as many tangents as settings, and the run is not stored. The function is
+    compiled once for each `build`.
+    """
+    run = found_again(_loss_and_slopes, curve, build, objective)
+    return run(curve, build, objective, points, data, guard)
+
+
+@persistent_jit(static=3)
+def _loss_and_slopes(
     curve: RangeTransform,
     build: FilterBuilder,
     objective: Objective,
@@ -213,12 +236,6 @@ def loss_and_slopes(
     data: TuningData,
     guard: Margin | None,
 ) -> tuple[Float[Array, " S"], Float[Array, "S n"]]:
-    """Logarithm of the objective, and its derivatives with respect to the unconstrained coordinates.
-
-    In forward mode there are as many tangents as settings, and the run is not stored. The function is
-    compiled once for each `build`.
-    """
-
     def loss(x: Float[Array, " n"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
         filter, changed = build_filter(build, curve.settings(x))
         value = jnp.log(evaluate(data, objective, filter, changed))

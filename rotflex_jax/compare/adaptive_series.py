@@ -116,7 +116,7 @@ class AdaptiveSeries:
     ) -> tuple[str, AdaptiveFilter]:
         """Settings in words and filter with the least error of its last weights on the other halves."""
         P, rule = basis.size, self.rule
-        # Of the filters, only Kalman's has the noise; the others are the same program for any noise.
+        # Only the Kalman filter uses the noise; for the others 0 keeps one program for all data.
         known = float(noise) if rule == "kalman" else 0.0
         build = FilterFactory(rule, tuple((basis.degrees > 1).tolist()), known)
         axes: dict[str, Any] = {

@@ -59,19 +59,36 @@ OTHER_UNITS = COUNT_UNITS | {
 """Lower-case units of outputs other than radians and degrees; other words in brackets are remarks."""
 
 
-def clock_column(table: Table, time: str | None = None) -> str:
-    """The column of the time: the one that the user names, or `t`; a unit may end its name, as in `t_ms`."""
-    return table.find(time or "t", *(() if time else OTHER_NAMES["t"]), units={*TIME_UNITS, *TIME_WORDS})
+UNITS_IN_NAMES = {*TIME_UNITS, *TIME_WORDS, *OTHER_TIMES, *OTHER_UNITS}.union(*INPUT_UNITS.values()) | {
+    *("nsec", "nanosec", "nanoseconds", "usec", "microseconds"),
+}
+"""Words that may end the name of a column as its unit; two such columns leave it open which is meant."""
+
+
+def clock_column(table: Table, time: str | None = None, exact: bool = False) -> str:
+    """The column of the time: the one that the user names, or `t`; a unit may end its name, as in `t_ms`.
+
+    Args:
+        table: The columns of the file.
+        time: Name that the user gives, if any.
+        exact: Whether only a column with the name itself is a time, if the user gives no name.
+    """
+    if time is None and exact:
+        return table.find("t", *OTHER_NAMES["t"])
+    others = () if time else OTHER_NAMES["t"]
+    return table.find(time or "t", *others, units={*TIME_UNITS, *TIME_WORDS}, other_units=UNITS_IN_NAMES)
 
 
 def input_column(table: Table, name: str | None = None) -> str:
-    """The column of the input: the one that the user names, or `voltage`."""
-    return table.find("voltage" if name is None else name, units=INPUT_UNITS["V"])
+    """The column of the input: the one that the user names, or `voltage`; `V` or `volts` may end its name."""
+    units = INPUT_UNITS["V"] - {"voltage"}
+    return table.find("voltage" if name is None else name, units=units, other_units=UNITS_IN_NAMES)
 
 
 def sensor_column(table: Table, name: str) -> str:
     """The column of an output; a unit of angles may end its name, as in `theta_deg`."""
-    return table.find(name, *OTHER_NAMES.get(name, ()), units=set().union(*ANGLE_UNITS.values()))
+    units = set().union(*ANGLE_UNITS.values())
+    return table.find(name, *OTHER_NAMES.get(name, ()), units=units, other_units=UNITS_IN_NAMES)
 
 
 def unused_sensors(table: Table, channels: Sequence[str], used: set[str]) -> list[Finding]:

@@ -149,8 +149,9 @@ def _together(sources: Sequence[Any], label: str, max_bytes: int, time: str | No
                 table.columns[clock], f"{table.label}: column {clock!r}", table.where, table.first
             )
             stated = name_and_unit(clock)[1] or table.units.get(clock, "")
-            unit = stated or time_unit_of(table, clock)[0] or ""
-            names[unit] = f"t [{unit}]" if stated else f"t_{unit}" if unit else "t"
+            unit = time_unit_of(table, clock)[0] or stated
+            unit = "" if unit == "s" and not stated else unit  # seconds need not be named
+            names[unit] = f"t [{unit}]" if unit else "t"
             # Files with equal times share their clock.
             group = next((g for g, other in clocks.items() if np.array_equal(t, other)), group)
             clocks.setdefault(group, t)
@@ -345,7 +346,8 @@ def load(
                 f"{table.label}: the column {name!r} was given as a signal and as input or output, but it "
                 "can be only one; correct signals=."
             )
-    clock = clock_column(table, time)
+    # A unit at the end of a name is not used where units are accepted as they are, or the period is given.
+    clock = clock_column(table, time, exact=Ts is not None or "units" in accepted)
     names = [u_name, *acting.values(), *chosen.values()]
     own = list(dict.fromkeys(clock for name, clock in table.clocks.items() if name in names))
     if own and clock not in table.columns:  # the file assigns times to each signal

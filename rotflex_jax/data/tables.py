@@ -42,7 +42,9 @@ class Table:
     objects: Mapping[str, str] = field(default_factory=dict)
     clocks: Mapping[str, str] = field(default_factory=dict)
 
-    def find(self, name: str, *others: str, units: Collection[str] = ()) -> str:
+    def find(
+        self, name: str, *others: str, units: Collection[str] = (), other_units: Collection[str] = ()
+    ) -> str:
         """The column with a name, where capital letters and a unit after the name do not matter.
 
         Args:
@@ -50,6 +52,8 @@ class Table:
             others: other names of the same column.
             units: words in lower case that may end the name of the column without brackets, as in
                 `theta_deg`; used where no column has the name itself.
+            other_units: further such words; with a column that ends with one of them, it is open which is
+                meant.
 
         Returns:
             The name of the column, or `name` if there is no such column, or more than one.
@@ -58,8 +62,8 @@ class Table:
         >>> table = Table("run.csv", dict.fromkeys(names, np.zeros(1)))
         >>> table.find("theta"), table.find("t", "time"), table.find("alpha")
         ('Theta (deg)', 'Time [s]', 'alpha')
-        >>> table.find("alpha", units=("deg",))
-        'alpha_deg'
+        >>> table.find("alpha", units=("deg",)), table.find("alpha", units=("rad",), other_units=("deg",))
+        ('alpha_deg', 'alpha')
         """
         if not isinstance(name, str) or name in self.columns:
             return name
@@ -68,7 +72,9 @@ class Table:
         like = [column for column in self.columns if name_and_unit(column)[0].casefold() in wanted]
         if not like and units:
             parts = {c: re.fullmatch(r"(.+)[_ .-]([^\W\d_]+)", spaced(c).casefold()) for c in self.columns}
-            like = [c for c, found in parts.items() if found and found[1] in wanted and found[2] in units]
+            said = {c: found[2] for c, found in parts.items() if found and found[1] in wanted}
+            like = [c for c, unit in said.items() if unit in units or unit in other_units]
+            like = like if all(said[c] in units for c in like) else []
         return like[0] if len(like) == 1 else name
 
     def column(self, name: str, what: str) -> Shaped[np.ndarray, " N"]:

@@ -159,7 +159,7 @@ class PersistentJit:
         """The result of the function."""
         start_with_fast_loops()
         known, leaves = arguments[: self._static], jax.tree.leaves(arguments[self._static :])
-        if _plain() or any(isinstance(leaf, Tracer) for leaf in leaves):
+        if _plain() or any(isinstance(leaf, Tracer) or _elsewhere(leaf) for leaf in leaves):
             return self.jitted(*arguments)
         tree = jax.tree.structure(arguments[self._static :])
         kinds = tuple(jax.typeof(leaf) for leaf in leaves)
@@ -537,17 +537,23 @@ def _parts(value: Any) -> Iterator[str | None]:
 
 
 def _tree_key(tree: Any) -> str:
-    """A text that identifies the structure of arguments; empty if a class in it is not of this package."""
+    """A text that identifies the structure of arguments; empty if that cannot be told for certain."""
     node = tree.node_data()
     if node is None:
         return "*"
     kind, fields = node
-    said, parts = repr(fields), [_tree_key(part) for part in tree.children()]
+    # Equinox marks a field without a value, such as one that stands among the parts, by an object of its own.
+    values = [None if type(f).__module__.startswith("equinox._module") else f for f in fields or ()]
+    said, parts = static_key(tuple(values)), [_tree_key(part) for part in tree.children()]
     known = kind in (tuple, list, dict, type(None)) or kind.__module__.startswith(f"{_PACKAGE}.")
-    # The text of an array may be shortened, and the text of a function does not say what the function does.
-    if not known or "array(" in said or "<" in said or not all(parts):
+    if not known or not all((said, *parts)):
         return ""
     return f"{kind.__module__}.{kind.__qualname__}{said}({','.join(parts)})"
+
+
+def _elsewhere(leaf: Any) -> bool:
+    """Whether an array is on one device, but not on the first one, for which programs are made."""
+    return isinstance(leaf, jax.Array) and len(leaf.devices()) == 1 and leaf.devices() != {jax.devices()[0]}
 
 
 def _plain() -> bool:
