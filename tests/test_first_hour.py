@@ -635,6 +635,10 @@ def test_columns_are_found_by_names_that_end_with_a_unit(run, tmp_path) -> None:
     for rival in ("theta_counts", "theta_mm", "theta_V"):
         with pytest.raises(InputError, match="has no column 'theta'; it has"):
             rf.load(plain.assign(**{rival: THETA}))
+    with pytest.raises(
+        InputError, match="'theta_deg' is in deg by its name, but counts=4096 of one turn were"
+    ):
+        rf.load(plain, counts={"theta": 4096})
     # With a given period or accepted units the end of a name does not make a column the time.
     steady = rf.load(plain.rename(columns={"t_ms": "t_s"}).assign(t_s=RECORDING.Ts), Ts=RECORDING.Ts)
     assert np.allclose(steady.y, RECORDING.y)

@@ -282,6 +282,12 @@ def output(
     if counts is None and "units" not in accepted:
         _check_other_unit(table, channel, name, unit, degrees)
     turned = None if unit is None else in_radians(unit)
+    said, source = _angle_unit(table, name)
+    if counts is not None and said and "units" not in accepted:
+        raise InputError(
+            f"{label} is in {said} by its {source}, but counts={counts:g} of one turn were given; leave the "
+            "counts out, or name the column with the counts."
+        )
     if unit is not None and not (turned or unit.startswith("rad")):
         if degrees or counts is not None:
             raise InputError(
@@ -302,7 +308,6 @@ def output(
             f"{label} was given in {unit}, but degrees=True was given too, which is for all outputs; leave "
             "degrees=True out, and give the unit of each output in degrees, such as units={'theta': 'deg'}."
         )
-    said, source = _angle_unit(table, name)
     if said == "rad" and degrees:
         raise InputError(
             f"{label} is in rad by its {source}, but degrees=True was given, which is for all outputs; leave "
