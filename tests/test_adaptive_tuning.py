@@ -285,16 +285,15 @@ def test_other_values_compile_nothing_again(short: list[Recording]) -> None:
 
 
 def test_a_function_that_makes_the_filter_may_hold_traced_values(joint) -> None:
-    """The derivative by a factor in `build` is that by the setting, whose chain rule is 1 to 0.01."""
+    """With mu = s a, the derivative by a at a = 1 is mu times the derivative by mu."""
     short = [r.slice(0, 300) for r in joint[:2]]
     with double_precision():
         data = tuning_data(BASIS, short, "alpha", "mean_error")
 
         def error(a: jax.Array, point: float) -> jax.Array:
             build = lambda s: LMS(s["mu"] * a)  # noqa: E731
-            return values_at(jnp.array([[point]]), data, names=("mu",), build=build, objective="mean_error")[
-                0
-            ]
+            at = jnp.array([[point]])
+            return values_at(at, data, names=("mu",), build=build, objective="mean_error")[0]
 
         slope, h = float(jax.grad(error)(jnp.asarray(1.0), 0.01)), 1e-5
         difference = float(error(jnp.asarray(1.0), 0.01 + h) - error(jnp.asarray(1.0), 0.01 - h)) / (2 * h)

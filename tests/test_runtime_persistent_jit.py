@@ -489,6 +489,13 @@ def test_nothing_is_kept_of_a_law_from_elsewhere() -> None:
     assert not static_key((rf.joints.paper() + Own(at="hub")).structure)
 
 
+def in_two_processes(script: str, folder: Path) -> list[Any]:
+    """What a script prints as JSON in two processes, one after the other, with one folder of programs."""
+    command = [sys.executable, "-c", script, str(folder)]
+    runs = [subprocess.run(command, capture_output=True, text=True, check=True) for _ in range(2)]
+    return [json.loads(run.stdout.splitlines()[-1]) for run in runs]
+
+
 class Doubled(Bank):
     """A bank of a user: its law is not in the source of this package."""
 
@@ -576,13 +583,7 @@ print(json.dumps([errors, bank.poles[0].real, counts.compiled, counts.loaded]))
 
 
 def test_a_comparison_of_series_in_a_second_process_compiles_nothing(tmp_path: Path) -> None:
-    found = []
-    for _ in range(2):
-        run = subprocess.run(
-            [sys.executable, "-c", SERIES, str(tmp_path)], capture_output=True, text=True, check=True
-        )
-        found.append(json.loads(run.stdout.splitlines()[-1]))
-    (*first, made, none), (*second, again, loaded) = found
+    (*first, made, none), (*second, again, loaded) = in_two_processes(SERIES, tmp_path)
     assert first == second and len(first[0]) == 3
     assert none == again == 0 and loaded == made > 8
 
@@ -606,13 +607,7 @@ print(json.dumps([model.simulate(recording)[-1].tolist(), len(count)]))
 
 
 def test_a_simulation_in_a_second_process_is_the_same_and_traces_no_step(tmp_path: Path) -> None:
-    found = []
-    for _ in range(2):
-        run = subprocess.run(
-            [sys.executable, "-c", SECOND, str(tmp_path)], capture_output=True, text=True, check=True
-        )
-        found.append(json.loads(run.stdout))
-    (first, steps), (second, none) = found
+    (first, steps), (second, none) = in_two_processes(SECOND, tmp_path)
     assert first == second and steps > 0 and none == 0
 
 

@@ -30,7 +30,7 @@ from rotflex_jax.errors import InputError
 from rotflex_jax.recording import Recording
 from rotflex_jax.recording.recording import listed
 from rotflex_jax.recording.samples import of_one_period
-from rotflex_jax.runtime.persistent_jit import PersistentJit, persistent_jit, static_key
+from rotflex_jax.runtime.persistent_jit import persistent_jit
 from rotflex_jax.runtime.xla import double_precision, spread
 
 FilterBuilder = Callable[[dict[str, Any]], AdaptiveFilter | tuple[AdaptiveFilter, Basis]]
@@ -380,19 +380,10 @@ def values_at(
     mesh: Mesh | None = None,
 ) -> Float[Array, " K"]:
     """The objective at many points, on each device some at a time; compiled once per `build`."""
-    run = found_again(_values_on, names, build, objective, mesh)
-    return run(names, build, objective, mesh, points, data)
+    return _values_on(names, build, objective, mesh, points, data)
 
 
-def found_again(program: PersistentJit, *known: Any) -> Callable[..., Any]:
-    """The program, if it can be found again on disk by its static arguments; else `jax.jit` of its function.
-
-    A function of a user may hold values that are traced, and several devices need arrays on each of them.
-    """
-    return program if static_key(known) else program.jitted
-
-
-@persistent_jit(static=4)
+@persistent_jit(static=4, only_known=True)
 def _values_on(
     names: tuple[str, ...],
     build: FilterBuilder,

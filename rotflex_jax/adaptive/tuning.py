@@ -21,7 +21,6 @@ from rotflex_jax.adaptive.objectives import (
     TuningPath,
     build_filter,
     evaluate,
-    found_again,
     sample_moments,
     starting_sets,
     tuning_data,
@@ -223,11 +222,10 @@ def loss_and_slopes(
     In forward mode there are as many tangents as settings, and the run is not stored. The function is
     compiled once for each `build`.
     """
-    run = found_again(_loss_and_slopes, curve, build, objective)
-    return run(curve, build, objective, points, data, guard)
+    return _loss_and_slopes(curve, build, objective, points, data, guard)
 
 
-@persistent_jit(static=3)
+@persistent_jit(static=3, only_known=True)
 def _loss_and_slopes(
     curve: RangeTransform,
     build: FilterBuilder,

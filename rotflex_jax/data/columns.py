@@ -153,11 +153,12 @@ def named_signals(signals: Any, table: Table) -> dict[str, str]:
 
 def _with_unit(table: Table, column: str) -> str:
     """Name of a column with its unit in brackets, if the file has a unit for it."""
-    name, unit = name_and_unit(column)[0], _unit(table, column)
+    name, unit = name_and_unit(column)[0], stated_unit(table, column)
     return f"{name} [{unit}]" if unit else name
 
 
-def _unit(table: Table, column: str) -> str:
+def stated_unit(table: Table, column: str) -> str:
+    """The unit in brackets after the name of a column, or in the line of units; empty if there is none."""
     return name_and_unit(column)[1] or table.units.get(column, "").strip(" []()")
 
 
@@ -214,7 +215,7 @@ def input_unit(table: Table, name: str, given: str | None, any_unit: bool) -> st
     Raises:
         InputError: The two are not the same unit.
     """
-    unit, words = _unit(table, name), _words(table, name)
+    unit, words = stated_unit(table, name), _words(table, name)
     source = _unit_source(name, unit)
     if unit.lower() in ("", "-", "–", "1"):
         unit, source = "A" if "current" in words else "V" if words & INPUT_UNITS["V"] else "", "name"
@@ -318,7 +319,7 @@ def output(
             f"{label} is in {said} by its {source}, but was given in {unit}; leave out that unit, or correct "
             "what the file says."
         )
-    own = _own_radians(_unit(table, name))
+    own = _own_radians(stated_unit(table, name))
     if not (turned or degrees or said == "deg"):
         return values, unit or own
     if whole_numbers(values) and "units" not in accepted:
@@ -342,7 +343,7 @@ def _own_radians(unit: str) -> str:
 
 def _check_other_unit(table: Table, channel: str, name: str, given: str | None, degrees: bool) -> None:
     """Refuses a column that by the file is in neither radians nor degrees, unless its unit is given."""
-    own = _unit(table, name)
+    own = stated_unit(table, name)
     if own.lower() not in OTHER_UNITS or (given or "").lower() == own.lower():
         return
     said = f"{table.label}: column {name!r} is in {own} by its {_unit_source(name, own)}"
@@ -368,7 +369,7 @@ def _check_other_unit(table: Table, channel: str, name: str, given: str | None, 
 
 def _angle_unit(table: Table, name: str) -> tuple[str | None, str]:
     """Unit of an angle, "deg" or "rad", by the unit in the file or else by the name; and where it is said."""
-    for words in (_split(_unit(table, name)), _words(table, name)):
+    for words in (_split(stated_unit(table, name)), _words(table, name)):
         said = [unit for unit, spellings in ANGLE_UNITS.items() if words & spellings]
         if len(said) == 1:
             return said[0], _unit_source(name, min(words & ANGLE_UNITS[said[0]]))
@@ -413,7 +414,7 @@ def time_stamps(
             f"{table.label}: column {name!r} is in {said} by its {source}, but time_unit={time_unit!r} was "
             f"given; pass time_unit={said!r}, or correct what the file says."
         )
-    own = _unit(table, name)
+    own = stated_unit(table, name)
     if own.lower() in OTHER_TIMES and not any_unit:
         raise InputError(
             f"{table.label}: column {name!r} is in {own} by its {_unit_source(name, own)}, but a time is "
@@ -432,7 +433,7 @@ def time_stamps(
 def time_unit_of(table: Table, name: str, by_name: bool = True) -> tuple[str | None, str]:
     """Unit of a time by the unit in the file, or by the last word of the name; and where it is said."""
     last = re.findall(r"[^\W\d_]+", spaced(name_and_unit(name)[0]).lower())[-1:] if by_name else []
-    for word in (_unit(table, name).lower(), *last):
+    for word in (stated_unit(table, name).lower(), *last):
         unit = TIME_WORDS.get(word, word if word in TIME_UNITS else None)
         if unit is not None:
             return unit, _unit_source(name, word)
@@ -452,9 +453,9 @@ def conversions_by_name(table: Table, outputs: Mapping[str, str], clock: str) ->
             "converted", channel, f"Column {name!r} was converted from degrees because of its name.", "note"
         )
         for channel, name in outputs.items()
-        if not _unit(table, name) and _angle_unit(table, name)[0] == "deg"
+        if not stated_unit(table, name) and _angle_unit(table, name)[0] == "deg"
     ]
-    unit = time_unit_of(table, clock)[0] if clock and not _unit(table, clock) else None
+    unit = time_unit_of(table, clock)[0] if clock and not stated_unit(table, clock) else None
     if unit not in (None, "s"):
         message = f"The time {clock!r} was converted from {unit} because of its name."
         notes.append(Finding("converted", "time", message, "note"))

@@ -30,6 +30,7 @@ from rotflex_jax.data.columns import (
     named_signals,
     output,
     sensor_column,
+    stated_unit,
     time_stamps,
     time_unit_of,
     timing,
@@ -134,7 +135,7 @@ def _together(sources: Sequence[Any], label: str, max_bytes: int, time: str | No
     paths = [readable_file(source) for source in sources]
     tables = [read_table(path, max_bytes) for path in paths]
     clocks: dict[str, Any] = {}
-    names: dict[str, str] = {}  # unit of a time -> name of its column
+    units: set[str] = set()
     channels: list[Channel] = []
     alone: list[str | None] = []  # names of files with one channel
     file_of: dict[tuple[str, str], Path] = {}
@@ -148,10 +149,9 @@ def _together(sources: Sequence[Any], label: str, max_bytes: int, time: str | No
             t = real_numbers(
                 table.columns[clock], f"{table.label}: column {clock!r}", table.where, table.first
             )
-            stated = name_and_unit(clock)[1] or table.units.get(clock, "")
+            stated = stated_unit(table, clock)
             unit = time_unit_of(table, clock)[0] or stated
-            unit = "" if unit == "s" and not stated else unit  # seconds need not be named
-            names[unit] = f"t [{unit}]" if unit else "t"
+            units.add("" if unit == "s" and not stated else unit)  # seconds need not be named
             # Files with equal times share their clock.
             group = next((g for g, other in clocks.items() if np.array_equal(t, other)), group)
             clocks.setdefault(group, t)
@@ -164,14 +164,15 @@ def _together(sources: Sequence[Any], label: str, max_bytes: int, time: str | No
                 )
         channels += [Channel(group, name, table.units.get(name, ""), table.columns[name]) for name in own]
         alone += [path.stem] if len(own) == 1 else [None] * len(own)
-    if len(names) > 1:
-        named = " and ".join(repr(unit) for unit in sorted(names))
+    if len(units) > 1:
+        named = " and ".join(repr(unit) for unit in sorted(units))
         raise InputError(f"{label}: the times are in {named}, but must have one unit; export them alike.")
     if len({channel.name for channel in channels}) < len(channels):
         channels = [
             c if name is None else c._replace(name=name) for c, name in zip(channels, alone, strict=True)
         ]
-    return table_of_channels(label, channels, clocks, next(iter(names.values()), "t"))
+    unit = "".join(units)
+    return table_of_channels(label, channels, clocks, f"t [{unit}]" if unit else "t")
 
 
 def readable_file(source: Any) -> Path:

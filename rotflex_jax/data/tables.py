@@ -73,8 +73,8 @@ class Table:
         if not like and units:
             parts = {c: re.fullmatch(r"(.+)[_ .-]([^\W\d_]+)", spaced(c).casefold()) for c in self.columns}
             said = {c: found[2] for c, found in parts.items() if found and found[1] in wanted}
-            like = [c for c, unit in said.items() if unit in units or unit in other_units]
-            like = like if all(said[c] in units for c in like) else []
+            if not any(unit in other_units and unit not in units for unit in said.values()):
+                like = [c for c, unit in said.items() if unit in units]
         return like[0] if len(like) == 1 else name
 
     def column(self, name: str, what: str) -> Shaped[np.ndarray, " N"]:

@@ -130,8 +130,8 @@ _storage = _Storage()
 class PersistentJit:
     """`jax.jit` of a pure function whose first arguments are static; compiled programs are kept on disk.
 
-    Do not differentiate it or map over it: do this inside the function instead. On devices other than a CPU,
-    and inside of other programs, it is the same as `jax.jit`.
+    Do not differentiate it or map over it: do this inside the function instead. On devices other than a CPU
+    or than the first one, and inside of other programs, it is the same as `jax.jit`.
 
     Args:
         function: Pure function of a module of this package that returns arrays, in tuples or named tuples.
@@ -140,15 +140,21 @@ class PersistentJit:
             samples run as fast as at level 3 and compile in four fifths of the time; runs with derivatives
             need level 3. Level 0 is for large programs that run a few times: they compile in half of the
             time, but loops take five to ten times as long.
+        only_known: Whether it is the same as `jax.jit` too where static arguments have no `static_key`: a
+            function of a user may hold traced values, and a mesh of devices places arrays on each of them.
     """
 
     def __init__(
-        self, function: Callable[..., Any], static: int, optimisation_level: int | None = None
+        self,
+        function: Callable[..., Any],
+        static: int,
+        optimisation_level: int | None = None,
+        only_known: bool = False,
     ) -> None:
         self.jitted = jax.jit(function, static_argnums=tuple(range(static)))
         level = optimisation_level
         self._level = {} if level is None else {"xla_backend_optimization_level": level}
-        self._static = static
+        self._static, self._only_known = static, only_known
         self._name = f"{function.__module__}.{function.__qualname__}"
         self._held: dict[Any, _Held] = {}
         # Programs that a thread is making; other threads that need the same program wait.
@@ -159,7 +165,9 @@ class PersistentJit:
         """The result of the function."""
         start_with_fast_loops()
         known, leaves = arguments[: self._static], jax.tree.leaves(arguments[self._static :])
-        if _plain() or any(isinstance(leaf, Tracer) or _elsewhere(leaf) for leaf in leaves):
+        if _plain() or any(isinstance(leaf, Tracer) for leaf in leaves) or _elsewhere(leaves):
+            return self.jitted(*arguments)
+        if self._only_known and not static_key(known):
             return self.jitted(*arguments)
         tree = jax.tree.structure(arguments[self._static :])
         kinds = tuple(jax.typeof(leaf) for leaf in leaves)
@@ -241,10 +249,10 @@ class PersistentJit:
 
 
 def persistent_jit(
-    static: int, optimisation_level: int | None = None
+    static: int, optimisation_level: int | None = None, only_known: bool = False
 ) -> Callable[[Callable[..., Any]], PersistentJit]:
     """Decorator that makes a function a `PersistentJit`; arguments as in `PersistentJit`."""
-    return lambda function: PersistentJit(function, static, optimisation_level)
+    return lambda function: PersistentJit(function, static, optimisation_level, only_known)
 
 
 def make_ahead(function: Callable[..., Any], *arguments: Any) -> None:
@@ -551,9 +559,12 @@ def _tree_key(tree: Any) -> str:
     return f"{kind.__module__}.{kind.__qualname__}{said}({','.join(parts)})"
 
 
-def _elsewhere(leaf: Any) -> bool:
-    """Whether an array is on one device, but not on the first one, for which programs are made."""
-    return isinstance(leaf, jax.Array) and len(leaf.devices()) == 1 and leaf.devices() != {jax.devices()[0]}
+def _elsewhere(leaves: list[Any]) -> bool:
+    """Whether one of the arrays is on one device, but not on the first one, for which programs are made."""
+    if jax.device_count() == 1:
+        return False
+    places = (leaf.devices() for leaf in leaves if isinstance(leaf, jax.Array))
+    return any(len(place) == 1 and place != {jax.devices()[0]} for place in places)
 
 
 def _plain() -> bool:
