@@ -53,7 +53,7 @@ def main() -> None:
     sets = {str(n): jax.devices()[:n] for n in ((2, 8) if alone else (4,))}
     plain = sweep(jax.local_devices()[:1])
     spreads = {n: sweep(devices) for n, devices in sets.items()}
-    compiled = len(_values_on)
+    compiled = _values_on.programs_made
     again = {n: sweep(devices, 0.9) for n, devices in sets.items()}
     print(
         json.dumps(
@@ -61,7 +61,7 @@ def main() -> None:
                 "plain": plain,
                 "spread": spreads,
                 "where": {n: where(devices) for n, devices in sets.items()},
-                "compiled_again": len(_values_on) - compiled,
+                "compiled_again": _values_on.programs_made - compiled,
                 "changed": all(again[n] != spreads[n] for n in sets),
             }
         )

@@ -278,10 +278,10 @@ def test_other_values_compile_nothing_again(short: list[Recording]) -> None:
     assert len(traces) == first > 0
     with double_precision():
         data = tuning_data(BASIS, short, "alpha", "final")
-        compiled = len(_values_on)
+        compiled = _values_on.programs_made
         for mu in (0.01, 0.02):
             values_at(jnp.array([[mu, mu]]), data, names=("mu1", "mu2"), build=build, objective="final")
-        assert len(_values_on) == compiled + 1
+        assert _values_on.programs_made == compiled + 1
 
 
 def test_a_function_that_makes_the_filter_may_hold_traced_values(joint) -> None:

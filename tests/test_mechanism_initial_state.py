@@ -93,13 +93,13 @@ def test_other_numbers_of_stretches_compile_nothing_and_change_none(truth):
     found = initial_states(mechanism, Exponential(), gates, u, y, r["Ts"])
     assert found.shape == (70, 4)
     few = initial_states(mechanism, Exponential(), gates, u[:3], y[:3], r["Ts"])
-    held = len(_fitted_states)
+    held = _fitted_states.programs_made
     for chosen in ([69], range(20, 70)):
         pick = list(chosen)
         alone = initial_states(mechanism, Exponential(), gates, u[pick], y[pick], r["Ts"])
         np.testing.assert_allclose(alone, found[pick], rtol=0, atol=1e-7)
     np.testing.assert_allclose(few, found[:3], rtol=0, atol=1e-7)
-    assert len(_fitted_states) == held
+    assert _fitted_states.programs_made == held
 
 
 def test_samples_of_another_shape_compile_nothing_but_the_program_that_uses_them(truth, caplog):

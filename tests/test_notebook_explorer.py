@@ -85,11 +85,11 @@ def test_a_moved_number_is_that_of_the_model(explorer: Explorer, recording: rf.R
 
 def test_nothing_is_compiled_again(explorer: Explorer) -> None:
     explorer.switches[SPRING].value = True
-    compiled = len(_free_many)
+    compiled = _free_many.programs_made
     explorer.switches[FRICTION].value = False
     explorer.parameter.value = "hub.inertia.inertia"
     explorer.factor.value = 0.8
-    assert len(_free_many) == compiled
+    assert _free_many.programs_made == compiled
 
 
 def test_any_effect_of_the_catalogue_is_added_and_taken_back(explorer: Explorer) -> None:

@@ -296,6 +296,7 @@ def test_programs_not_used_for_longest_leave_the_memory(
         assert len(persistent_jit._recent) <= 6
     # 13 programs were made and at most six stay; the one that is always in use was made once.
     assert len(program) <= 5 and len(other) == 1
+    assert (program.programs_made, other.programs_made) == (12, 1)
     assert traced.count(0.5) == 1 and len(files(folder)) == 13
     np.testing.assert_array_equal(program(0.0, x), 0 * x)  # loaded again
     assert traced.count(0.0) == 1

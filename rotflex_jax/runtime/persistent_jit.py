@@ -157,6 +157,7 @@ class PersistentJit:
         self._static, self._only_known = static, only_known
         self._name = f"{function.__module__}.{function.__qualname__}"
         self._held: dict[Any, _Held] = {}
+        self._made_here = 0
         # Programs that a thread is making; other threads that need the same program wait.
         self._in_work: dict[Any, Future[None]] = {}
         _programs.append(self)
@@ -184,6 +185,8 @@ class PersistentJit:
             file = self._file(known, tree, kinds, settings)
             program, result = self._made(known, tree, leaves, file)
             held = self._held[key] = _Held(program, self._held, key, file)
+            with _recent_lock:
+                self._made_here += 1
         finally:  # after a failure, the next waiting thread makes the program itself
             with _recent_lock:
                 self._in_work.pop(key).set_result(None)
@@ -212,7 +215,16 @@ class PersistentJit:
 
     def __len__(self) -> int:
         """Number of programs in memory: one for each structure and shapes of the arguments."""
-        return len(self._held) + self.jitted._cache_size()  # pyright: ignore[reportAttributeAccessIssue]
+        return len(self._held) + self._of_jax
+
+    @property
+    def programs_made(self) -> int:
+        """Number of programs compiled or loaded so far; it stays the same when programs are released."""
+        return self._made_here + self._of_jax
+
+    @property
+    def _of_jax(self) -> int:
+        return self.jitted._cache_size()  # pyright: ignore[reportAttributeAccessIssue]
 
     def release_programs(self) -> None:
         """Release the programs in memory."""
