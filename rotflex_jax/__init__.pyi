@@ -63,7 +63,8 @@ from .models.model import Model as Model
 from .models.series import Series as Series
 from .notebook import explore as explore, live as live
 from .recording import Recording as Recording
-from .runtime.persistent_jit import keep_programs as keep_programs, performance as performance
+from .runtime.persistent_jit import performance as performance
+from .runtime.program_files import keep_programs as keep_programs
 from .runtime.xla import (
     enable_compilation_cache as enable_compilation_cache,
     enable_fast_loops as enable_fast_loops,

@@ -16,7 +16,7 @@ from rotflex_jax.mechanism import Exponential, Mechanism, SmoothRK4
 from rotflex_jax.mechanism.quantity import Units
 from rotflex_jax.models.model import Model
 from rotflex_jax.recording import Recording
-from rotflex_jax.runtime.persistent_jit import static_key
+from rotflex_jax.runtime.program_files import static_key
 
 AWKWARD = (0.1 + 0.2, 1 / 3, np.pi * 1e-9, 5e-324, 1.7976931348623157e308)
 

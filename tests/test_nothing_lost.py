@@ -95,7 +95,7 @@ def test_every_file_is_written_by_one_function() -> None:
     direct = r"\.write_text\(|\.write_bytes\(|\bopen\([^)]*[\"'][wax]"
     direct += r"|savefig\((?!picture|buffer|file)|json\.dump\(|np\.save\w*\((?!text)|\.to_csv\([^)]"
     # The second file writes compiled programs, by a temporary file that is renamed.
-    allowed = {PACKAGE / "text" / "files.py", PACKAGE / "runtime" / "persistent_jit.py"}
+    allowed = {PACKAGE / "text" / "files.py", PACKAGE / "runtime" / "program_files.py"}
     found = {
         f"{path.relative_to(PACKAGE)}: {line.strip()}"
         for path in sorted({*PACKAGE.rglob("*.py")} - allowed)

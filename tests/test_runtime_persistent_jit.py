@@ -31,19 +31,17 @@ from rotflex_jax.effects.base import Force
 from rotflex_jax.mechanism import Exponential
 from rotflex_jax.mechanism.quantity import Units
 from rotflex_jax.parameters import parameter
-from rotflex_jax.runtime import persistent_jit
+from rotflex_jax.runtime import persistent_jit, program_files
 from rotflex_jax.runtime.persistent_jit import (
     PersistentJit,
     clear_compilation_caches,
-    keep_programs,
     loaded_ahead,
     make_ahead,
     performance,
     program_counts,
-    programs_folder,
     release_programs,
-    static_key,
 )
+from rotflex_jax.runtime.program_files import keep_programs, programs_folder, static_key
 from rotflex_jax.runtime.xla import double_precision
 
 traced = []
@@ -64,8 +62,8 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """An empty cache folder, and source files that are older than the process."""
     before = jax.config.values["jax_compilation_cache_dir"]
     jax.config.update("jax_compilation_cache_dir", str(tmp_path))
-    monkeypatch.delenv(persistent_jit.FOLDER_VARIABLE, raising=False)
-    monkeypatch.setattr(persistent_jit, "_LOADED", time.time() + 3600.0)
+    monkeypatch.delenv(program_files.FOLDER_VARIABLE, raising=False)
+    monkeypatch.setattr(program_files, "_LOADED", time.time() + 3600.0)
     traced.clear()
     yield tmp_path
     jax.config.update("jax_compilation_cache_dir", before)
@@ -159,7 +157,7 @@ def test_garbage_is_not_searched_for_while_programs_are_made(
     """Several threads make programs, and one fails; afterwards the setting of the user holds again."""
     seen: list[bool] = []
     if not kept:
-        monkeypatch.setattr(persistent_jit, "programs_folder", lambda: None)
+        monkeypatch.setattr(program_files, "programs_folder", lambda: None)
 
     def line(slope: float, x: jax.Array) -> jax.Array:
         seen.append(gc.isenabled())
@@ -227,13 +225,13 @@ def test_programs_are_counted_and_one_that_is_loaded_runs_once(
 @pytest.fixture
 def loads(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, str]]:
     """Thread and file of each program that is read."""
-    read, found = persistent_jit._stored_program, []
+    read, found = persistent_jit.read_program, []
 
     def watched(file: Path) -> Any:
         found.append((threading.current_thread().name.partition("_")[0], file.name))
         return read(file)
 
-    monkeypatch.setattr(persistent_jit, "_stored_program", watched)
+    monkeypatch.setattr(persistent_jit, "read_program", watched)
     return found
 
 
@@ -333,8 +331,8 @@ def test_two_machines_with_other_units_have_other_programs() -> None:
 
 
 def test_folders_of_somebody_else_stay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv(persistent_jit.FOLDER_VARIABLE, raising=False)
-    monkeypatch.setattr(persistent_jit, "_LOADED", time.time() + 3600.0)
+    monkeypatch.delenv(program_files.FOLDER_VARIABLE, raising=False)
+    monkeypatch.setattr(program_files, "_LOADED", time.time() + 3600.0)
     others = [tmp_path / name for name in ("thesis", "photos", "data", "more", "a", "b", "c")]
     for other in others:
         other.mkdir()
@@ -353,7 +351,7 @@ def test_what_was_not_used_for_long_is_deleted_first(folder: Path) -> None:
     oldest, newer, newest = sorted(files(folder), key=lambda f: f.stat().st_mtime_ns)
     for age, file in enumerate((oldest, newest, newer)):
         os.utime(file, (1e9 + age, 1e9 + age))
-    persistent_jit._shrink(oldest.parent, newer.stat().st_size + newest.stat().st_size)
+    program_files._shrink(oldest.parent, newer.stat().st_size + newest.stat().st_size)
     assert set(files(folder)) == {newer, newest}
 
 
@@ -361,9 +359,9 @@ def test_a_program_with_linear_algebra_runs_in_a_process_that_has_compiled_none(
     """Such a program calls a library that JAX registers only when it lowers a call of it."""
     code = """
 import sys, json, numpy as np, jax.numpy as jnp
-from rotflex_jax.runtime import persistent_jit
-persistent_jit._LOADED += 3600.0
-persistent_jit.keep_programs(sys.argv[1])
+from rotflex_jax.runtime import persistent_jit, program_files
+program_files._LOADED += 3600.0
+program_files.keep_programs(sys.argv[1])
 program = persistent_jit.PersistentJit(lambda A, b: jnp.linalg.solve(A, b), static=0)
 A = np.array([[2.0, 1.0], [1.0, 3.0]], np.float32)
 print(json.dumps(program(A, np.array([3.0, 4.0], np.float32)).tolist()))
@@ -379,7 +377,7 @@ print(json.dumps(program(A, np.array([3.0, 4.0], np.float32)).tolist()))
 def test_nothing_is_kept_of_source_that_changed_under_the_process(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(persistent_jit, "_LOADED", 0.0)
+    monkeypatch.setattr(program_files, "_LOADED", 0.0)
     assert new()(2.0, np.ones(1))[0] == 2.0
     assert not files(folder)
 
@@ -410,8 +408,8 @@ def test_a_program_runs_on_constants_inside_of_another_program(folder: Path, kep
 def test_a_folder_may_be_chosen_and_the_usual_one_is_the_users(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.delenv(persistent_jit.FOLDER_VARIABLE, raising=False)
-    monkeypatch.setattr(persistent_jit, "_LOADED", time.time() + 3600.0)
+    monkeypatch.delenv(program_files.FOLDER_VARIABLE, raising=False)
+    monkeypatch.setattr(program_files, "_LOADED", time.time() + 3600.0)
     before = jax.config.values["jax_compilation_cache_dir"]
     jax.config.update("jax_compilation_cache_dir", None)
     try:
@@ -530,7 +528,7 @@ def test_the_structure_of_an_argument_is_part_of_its_program(folder: Path) -> No
             np.testing.assert_allclose(program(bank, u)[:, -1], (2.0 + isinstance(bank, Volterra)) * u)
         assert len(program) == len(bases) + 2 and len(files(folder)) == len(bases)
     tree = jax.tree.structure({Rule(1): 0.0})
-    assert "Rule" in str(tree) and not persistent_jit._tree_key(tree)
+    assert "Rule" in str(tree) and not program_files.tree_key(tree)
 
 
 @dataclasses.dataclass(frozen=True, order=True)
@@ -567,8 +565,8 @@ import json, sys
 import numpy as np
 import rotflex_jax as rf
 from rotflex_jax.basis import optimise_poles
-from rotflex_jax.runtime import persistent_jit
-persistent_jit._LOADED += 3600.0
+from rotflex_jax.runtime import persistent_jit, program_files
+program_files._LOADED += 3600.0
 rf.keep_programs(sys.argv[1])
 rng = np.random.default_rng(1)
 u = rng.normal(size=(2, 400))
@@ -593,8 +591,8 @@ SECOND = """
 import json, sys
 import numpy as np
 import rotflex_jax as rf
-from rotflex_jax.runtime import persistent_jit
-persistent_jit._LOADED += 3600.0
+from rotflex_jax.runtime import program_files
+program_files._LOADED += 3600.0
 rf.enable_compilation_cache(sys.argv[1])
 u = np.random.default_rng(1).normal(size=300)
 model = rf.Model(rf.joints.paper())
