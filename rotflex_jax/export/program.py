@@ -12,15 +12,17 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Integer
+from jaxtyping import Array, Float, Integer, Real
 
 from rotflex_jax.errors import InputError
 from rotflex_jax.export.expression import Expression, Operand, make, node
 from rotflex_jax.export.unfold import CALLS, MOVES, CannotUnfold, each, moved, run, unfold, unknown
 from rotflex_jax.mechanism.assembly import Layout, motor_voltage
+from rotflex_jax.mechanism.mechanism import Mechanism
 from rotflex_jax.mechanism.shortcut import without_shortcuts
-from rotflex_jax.mechanism.simulate import read_outputs
+from rotflex_jax.mechanism.simulate import Solver, read_outputs
 from rotflex_jax.models.model import Model
+from rotflex_jax.runtime.persistent_jit import persistent_jit
 from rotflex_jax.runtime.xla import double_precision
 
 SEQUENCE_LENGTH = 16384
@@ -257,7 +259,7 @@ def _program(model: Model, Ts: float) -> SampleProgram:
     with double_precision():
         values, gates = model.parameters_and_gates()
         one_step: Any = dataclasses.replace(solver, substeps=1)  # the C code repeats it `substeps` times
-        constants = solver.prepare(structure, values, gates, jnp.asarray(Ts))
+        constants = _constants(structure, solver, values, gates, jnp.asarray(Ts))
         outputs = unfold(lambda s: read_outputs(mechanism, gates, s), x)
         with without_shortcuts():
             advanced = unfold(lambda s, w: one_step.advance(structure, s, w, constants), x, v)
@@ -265,6 +267,18 @@ def _program(model: Model, Ts: float) -> SampleProgram:
             lambda u: motor_voltage(mechanism, gates, u, jnp.asarray(Ts)), node("u")
         )
     return SampleProgram(list(outputs), voltage, tuple(memories), list(advanced))
+
+
+@persistent_jit(static=2)
+def _constants(
+    structure: Mechanism,
+    solver: Solver,
+    values: Real[Array, " P"],
+    gates: Float[Array, " E"],
+    Ts: Float[Array, ""],
+) -> Any:
+    """Constants of the step; as one program, since each operation by itself would be compiled."""
+    return solver.prepare(structure, values, gates, Ts)
 
 
 def _obstacle(model: Model, Ts: float) -> str:
