@@ -213,7 +213,6 @@ def test_programs_are_counted_and_one_that_is_loaded_runs_once(
         return lambda *leaves: (runs.append(leaves), program(*leaves))[1]
 
     monkeypatch.setattr(serialize_executable, "deserialize_and_load", watched)
-    # No other test has this slope: a program that JAX loads from its own cache cannot be stored.
     for program in (new(), new()):
         for _ in range(3):
             np.testing.assert_array_equal(program(7.25, x), 7.25 * x)
@@ -238,7 +237,6 @@ def loads(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, str]]:
 def test_programs_of_the_last_block_alike_are_loaded_on_threads(
     folder: Path, loads: list[tuple[str, str]]
 ) -> None:
-    # No other test has these slopes: a program that JAX loads from its own cache cannot be stored.
     slopes, first = (6.125, 5.125, 4.125), new()
     with loaded_ahead("a search", (1, 2)):
         for slope in slopes:
@@ -353,6 +351,24 @@ def test_what_was_not_used_for_long_is_deleted_first(folder: Path) -> None:
         os.utime(file, (1e9 + age, 1e9 + age))
     program_files._shrink(oldest.parent, newer.stat().st_size + newest.stat().st_size)
     assert set(files(folder)) == {newer, newest}
+
+
+def test_what_jax_has_cached_is_stored_so_that_it_can_be_used(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """JAX may have cached a program of another version of this package, or one whose file here is lost."""
+    x = np.arange(3.0, dtype=np.float32)
+
+    def loaded() -> int:
+        before = program_counts().loaded
+        np.testing.assert_array_equal(new()(7.25, x), 7.25 * x)
+        return program_counts().loaded - before
+
+    assert [loaded() for _ in range(2)] == [0, 1]
+    for version in ("another", "a third"):
+        monkeypatch.setattr(program_files, "_SOURCE", version)
+        # The first process gets the program from JAX, and cannot store it; the second one compiles it.
+        assert [loaded() for _ in range(3)] == [0, 0, 1]
 
 
 def test_a_program_with_linear_algebra_runs_in_a_process_that_has_compiled_none(tmp_path: Path) -> None:

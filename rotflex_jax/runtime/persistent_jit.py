@@ -215,12 +215,16 @@ class PersistentJit:
         def flat(*leaves: Any) -> Any:
             return self.jitted(*known, *jax.tree.unflatten(tree, leaves))
 
-        program = jax.jit(flat, compiler_options=_options() | self._level)
         began = time.perf_counter()
         stored = None if file is None else _read(file, leaves)
         if stored is not None:
             _count(loaded=1)
             return stored
+        if file is not None and file.exists():
+            # The file is of no use. A program that JAX loads from a cache of its own, not compiled, is stored
+            # without its functions. JAX knows a program by its name too, so this one is compiled.
+            flat.__name__ = f"flat_{time.time_ns():x}"
+        program = jax.jit(flat, compiler_options=_options() | self._level)
         # Compiled here even where it is not kept: inside of another program, which may hold these arguments
         # as constants, JAX compiles nothing with options.
         with _without_garbage_collection:
@@ -470,7 +474,7 @@ def _read(file: Path, leaves: list[Any]) -> tuple[Callable[..., Any], Any] | Non
         program = read_program(file) if coming is None or coming.cancel() else coming.result()
         if program is None:
             return None
-        # A program that JAX had loaded from its own cache, not compiled, may be stored without its functions.
+        # A program that is stored without its functions, see `PersistentJit._made`, fails here.
         result = jax.block_until_ready(program(*leaves))
         mark_used(file)
         return program, result
