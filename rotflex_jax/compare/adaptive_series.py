@@ -11,6 +11,7 @@ from jaxtyping import Array, Float, Int
 
 from rotflex_jax.adaptive import LMS, NLMS, RLS, AdaptiveFilter, Kalman, grid, run, tune
 from rotflex_jax.basis import Volterra
+from rotflex_jax.basis.bank import evaluate
 from rotflex_jax.checks import Progress
 from rotflex_jax.compare.method import Fitted, require_one_sampling_period
 from rotflex_jax.compare.series import (
@@ -196,8 +197,8 @@ class NormalisedSeries(eqx.Module):
         return phi / jnp.asarray(self.scale)[None, :]
 
     def regressors(self, u: Any) -> Float[np.ndarray, "N P"]:
-        """Regressors for a signal, as a numpy array."""
-        return np.asarray(self.respond(jnp.asarray(u)))
+        """Regressors for a signal, in its precision."""
+        return evaluate(self, u)
 
 
 def _training_rows(x: SeriesRegression, hold: int) -> Float[np.ndarray, "N K"]:

@@ -16,8 +16,14 @@ from rotflex_jax.checks import one_of, positive, shown, signal
 from rotflex_jax.effects.base import Actuation, DryFriction, Memory
 from rotflex_jax.errors import InputError
 from rotflex_jax.mechanism import Mechanism
-from rotflex_jax.mechanism.assembly import Layout, effects_of, equations, rest_state
-from rotflex_jax.mechanism.linear import check_movable, process_covariance, state_names, zero_order_hold
+from rotflex_jax.mechanism.assembly import Layout, effects_of, rest_state
+from rotflex_jax.mechanism.linear import (
+    check_movable,
+    linear_equations,
+    process_covariance,
+    state_names,
+    zero_order_hold,
+)
 from rotflex_jax.mechanism.mechanism import check_input_alone
 from rotflex_jax.mechanism.quantity import input_word
 from rotflex_jax.mechanism.step import (
@@ -360,10 +366,9 @@ def controller(
     layout = Layout.of(mechanism.structure)
     n, size = layout.n, layout.rotor  # the rotor of a gear with play is taken to move with its port
     with double_precision():
-        eq = equations(mechanism, jnp.asarray(model.parameters_and_gates()[1]))
-        A, B, ports, inverse = (
-            np.asarray(m) for m in (eq.A[:size, :size], eq.B[:size], eq.ports[:size], eq.inverse_mass)
-        )
+        eq = linear_equations(mechanism, np.asarray(model.parameters_and_gates()[1]))
+    A, B, ports, inverse = map(np.asarray, eq)
+    A, B, ports = A[:size, :size], B[:size], ports[:size]
     row = np.zeros(size)
     row[:n] = mechanism.port_vectors[port]
     torque_at = {p: np.zeros(size) for p in mechanism.port_vectors}

@@ -1,13 +1,14 @@
 """A model in state space, linearised about an operating point, for control design."""
 
 import dataclasses
-from collections.abc import Sequence
+import functools
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Real
 
 from rotflex_jax.checks import number, positive, vector
 from rotflex_jax.errors import InputError, optional
@@ -18,6 +19,7 @@ from rotflex_jax.mechanism.quantity import input_word
 from rotflex_jax.mechanism.simulate import read_outputs
 from rotflex_jax.mechanism.step import has_smooth_torques, memory_rates, torques
 from rotflex_jax.models.model import Model
+from rotflex_jax.runtime.persistent_jit import persistent_jit
 from rotflex_jax.runtime.xla import double_precision
 
 
@@ -118,30 +120,18 @@ def state_space(
     number(voltage, "voltage", unit="V", example="0.0")
     mechanism, layout = model.mechanism, Layout.of(model.mechanism.structure)
     point = [_point(x, layout.n, what) for x, what in ((positions, "positions"), (speeds, "speeds"))]
-    start = layout.linear
+    x = rest_state(mechanism.structure, np.float64)
+    x[: 2 * layout.n] = np.concatenate(point)
+    word = input_word(mechanism.units.input)
+    inputs = (word, *(mechanism.signals if mechanism.takes_signals else ()))
+    u = np.array([float(voltage), *[0.0] * (len(inputs) - 1)])
     with double_precision():
-        gates = model.parameters_and_gates()[1]
-        eq = equations(mechanism, gates)
-        smooth = has_smooth_torques(mechanism)
-
-        def slope(x: Array, u: Array) -> Array:
-            L, z = x[:start], x[start:]
-            dL = eq.A @ L + eq.B * u[0]
-            if smooth:
-                dL = dL + eq.ports @ torques(mechanism, L, z, u if mechanism.takes_signals else u[0], gates)
-            return jnp.concatenate([dL, memory_rates(mechanism, L, z, u[0], gates)]) if z.shape[0] else dL
-
-        x = rest_state(mechanism.structure, np.float64)
-        x[: 2 * layout.n] = np.concatenate(point)
-        word = input_word(mechanism.units.input)
-        inputs = (word, *(mechanism.signals if mechanism.takes_signals else ()))
-        u = jnp.asarray([float(voltage), *[0.0] * (len(inputs) - 1)])
-        x = _steady_memories(slope, jnp.asarray(x), u, start)
-        A, B = (np.asarray(m) for m in jax.jacfwd(slope, argnums=(0, 1))(x, u))
-        C = np.asarray(jax.jacfwd(lambda s: read_outputs(mechanism, gates, s))(x))
+        slopes = functools.partial(_slopes, mechanism.structure, *model.parameters_and_gates())
+        x = _with_steady_memories(lambda x: slopes(x, u), x, layout.linear)
+        _, A, B, C = map(np.asarray, slopes(x, u))
     names = state_names(mechanism)
     # The linear model neglects the play of a gear, so the rotor has no states of its own.
-    rows = [i for i in range(layout.size) if not layout.rotor <= i < start]
+    rows = [i for i in range(layout.size) if not layout.rotor <= i < layout.linear]
     linear = LinearModel(
         A=A[np.ix_(rows, rows)],
         B=B[rows],
@@ -160,14 +150,40 @@ def _point(given: Sequence[float] | None, n: int, what: str) -> np.ndarray:
     return np.zeros(n) if given is None else vector(given, what, n, example=str([0.0] * n))
 
 
-def _steady_memories(slope: Any, x: Array, u: Array, start: int) -> Array:
+@persistent_jit(static=1)
+def _slopes(
+    structure: Mechanism,
+    values: Real[Array, " P"],
+    gates: Float[Array, " E"],
+    x: Float[Array, " n"],
+    u: Float[Array, " k"],
+) -> tuple[Array, Array, Array, Array]:
+    """Rates of the states without dry friction, their slopes by state and input, and those of the outputs."""
+    mechanism, start = structure.with_values(values), Layout.of(structure).linear
+    eq, smooth = equations(mechanism, gates), has_smooth_torques(mechanism)
+
+    def rate(x: Array, u: Array) -> Array:
+        L, z = x[:start], x[start:]
+        dL = eq.A @ L + eq.B * u[0]
+        if smooth:
+            dL = dL + eq.ports @ torques(mechanism, L, z, u if mechanism.takes_signals else u[0], gates)
+        return jnp.concatenate([dL, memory_rates(mechanism, L, z, u[0], gates)]) if z.shape[0] else dL
+
+    A, B = jax.jacfwd(rate, argnums=(0, 1))(x, u)
+    return rate(x, u), A, B, jax.jacfwd(lambda x: read_outputs(mechanism, gates, x))(x)
+
+
+def _with_steady_memories(
+    slopes: Callable[[np.ndarray], Sequence[Array]], x: Float[np.ndarray, " n"], start: int
+) -> Float[np.ndarray, " n"]:
     """The state with its memories, including currents, at their steady values if these exist."""
     for k in range(start, len(x)):
         for _ in range(20):
-            rate, gain = slope(x, u)[k], jax.jacfwd(lambda s: slope(s, u))(x)[k, k]
-            if not (jnp.isfinite(gain) and gain < 0):
+            rates, A = map(np.asarray, slopes(x)[:2])
+            rate, gain = float(rates[k]), float(A[k, k])
+            if not (np.isfinite(gain) and gain < 0):
                 break
-            x = x.at[k].add(-rate / gain)
+            x[k] -= rate / gain
             if abs(rate / gain) <= 1e-14 * (1 + abs(x[k])):
                 break
     return x

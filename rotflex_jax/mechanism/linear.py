@@ -108,19 +108,21 @@ def _equations(structure: Mechanism, values: jax.Array, gates: jax.Array) -> tup
     return tuple(equations(structure.with_values(values), gates))
 
 
-def _linear_part(
-    mechanism: Mechanism, gates: Float[np.ndarray, " E"] | None = None
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """`A`, `B` and the inverse mass matrix; with all effects on if `gates` is None."""
+def linear_equations(mechanism: Mechanism, gates: Float[np.ndarray, " E"] | None = None) -> EquationsOfMotion:
+    """Equations of motion of the linear effects in double precision, by one program for each structure.
+
+    Args:
+        mechanism: Mechanism with its parameter values.
+        gates: One factor per effect; all effects are on if None.
+    """
     with double_precision():
         gates = np.ones(len(mechanism.effects)) if gates is None else gates
-        eq = EquationsOfMotion(*_equations(mechanism.structure, mechanism.values, gates))
-        return np.asarray(eq.A), np.asarray(eq.B), np.asarray(eq.inverse_mass)
+        return EquationsOfMotion(*_equations(mechanism.structure, mechanism.values, gates))
 
 
 def inverse_mass(mechanism: Mechanism) -> Float[np.ndarray, "n n"]:
     """Inverse of the mass matrix of the coordinates."""
-    return _linear_part(mechanism)[2]
+    return np.asarray(linear_equations(mechanism).inverse_mass)
 
 
 def linearise(mechanism: Mechanism) -> StateSpace:
@@ -138,7 +140,7 @@ def _linearised(
     check_mechanism(mechanism)
     check_movable(mechanism)
     layout = Layout.of(mechanism.structure)
-    A, B, Minv = _linear_part(mechanism, gates)
+    A, B, _, Minv = map(np.asarray, linear_equations(mechanism, gates))
     C = np.zeros((len(mechanism.channels), layout.linear))
     C[:, : 2 * layout.n] = layout.output_rows
     return StateSpace(A, B, C), Minv
