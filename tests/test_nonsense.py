@@ -346,7 +346,11 @@ BAD: dict[tuple[str, str], list[tuple[Any, str]]] = {
         (3.0, r"is 3.0 of shape \(\); give for instance \[0.1, 0.0\]"),
     ],
     ("simulate", "solver"): [("rk4", r"must be Exponential\(...\) or SmoothRK4\(...\), but is 'rk4'")],
-    ("linearise", "mechanism"): [*NO_MODEL, (joints.paper(arm_inertia=0.0), "inertia")],
+    ("linearise", "mechanism"): [
+        *NO_MODEL,
+        (joints.paper(arm_inertia=0.0), "inertia"),
+        (MODEL, "a Model was given; give its attribute `mechanism`"),
+    ],
     ("controller", "model"): [*NO_MODEL, (joints.paper(arm_inertia=0.0), "inertia")],
     ("controller", "Ts"): [*NO_SECONDS, (None, "is None")],
     ("controller", "accuracy"): NO_SECONDS,

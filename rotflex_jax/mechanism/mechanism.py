@@ -535,6 +535,10 @@ class Mechanism:
 
 def check_mechanism(given: Any) -> None:
     """Raise `InputError` if the argument is not a mechanism."""
+    if isinstance(getattr(given, "mechanism", None), Mechanism):  # a model, or a result that has one
+        raise InputError(
+            f"A mechanism is needed, but a {type(given).__name__} was given; give its attribute `mechanism`."
+        )
     if not isinstance(given, Mechanism):
         raise InputError(
             f"A mechanism or a model is needed, but {shown(given)} was given; give for instance "
