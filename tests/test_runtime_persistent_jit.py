@@ -64,6 +64,8 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     jax.config.update("jax_compilation_cache_dir", str(tmp_path))
     monkeypatch.delenv(program_files.FOLDER_VARIABLE, raising=False)
     monkeypatch.setattr(program_files, "_LOADED", time.time() + 3600.0)
+    # In a process that has run many tests, it takes a second each time.
+    monkeypatch.setattr(persistent_jit, "_return_memory", lambda: None)
     traced.clear()
     yield tmp_path
     jax.config.update("jax_compilation_cache_dir", before)
