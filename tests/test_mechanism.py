@@ -25,8 +25,8 @@ OUTPUTS = {"theta": "hub", "alpha": "joint"}
 BODY = (fx.Inertia("hub", inertia=0.002), fx.Inertia("arm", inertia=0.006))
 
 
-def made(effects=BODY, ports=PORTS, outputs=OUTPUTS, trusted=()) -> Mechanism:
-    return Mechanism(("theta", "alpha"), ports, effects, outputs, trusted)
+def made(effects=BODY, ports=PORTS, outputs=OUTPUTS, trusted=(), units: Any = ("rad", "N m")) -> Mechanism:
+    return Mechanism(("theta", "alpha"), ports, effects, outputs, trusted, units)
 
 
 def noise(N: int, seed: int = 0) -> np.ndarray:
@@ -44,6 +44,10 @@ def noise(N: int, seed: int = 0) -> np.ndarray:
         ({"effects": (*BODY, fx.SensorBias("hub"))}, ["SensorBias", "hub", "alpha"]),
         ({"effects": (*BODY, fx.Inertia("hub", inertia=0.1))}, ["inertia", "hub", "Two"]),
         ({"trusted": ("hub.inertia.mass",)}, ["hub.inertia.mass", "hub.inertia.inertia"]),
+        ({"units": "m"}, ["units", "'m'", '("m", "N")']),
+        ({"units": ("m",)}, ["units", '("m", "N")']),
+        ({"units": ("m", 1.0)}, ["units", '("m", "N")']),
+        ({"units": ("m", "N", -1.0)}, ["units", '("m", "N")']),
     ],
 )
 def test_what_makes_no_sense_is_refused_in_words(given, words):
@@ -51,6 +55,24 @@ def test_what_makes_no_sense_is_refused_in_words(given, words):
         made(**given)
     for word in words:
         assert word in str(caught.value)
+
+
+def test_a_pair_of_units_is_taken() -> None:
+    """A cart on a rail, with its units written as in docs/own_machine.md."""
+    axis = Mechanism(
+        coordinates=["x"],
+        ports={"cart": (1,)},
+        effects=[fx.CurrentDrive("cart", gain=5.0), fx.Inertia("cart", inertia=2.0), fx.Viscous("cart")],
+        outputs={"x": "cart"},
+        units=("m", "N"),  # pyright: ignore[reportArgumentType]
+    )
+    units = [s.unit for s in axis.parameter_specifications]
+    assert dict(zip(axis.parameter_names, units, strict=True)) == {
+        "cart.current_drive.gain": "N/V",
+        "cart.inertia.inertia": "kg",
+        "cart.viscous.coefficient": "N s/m",
+    }
+    assert (axis + fx.Coulomb("cart")).units == axis.units
 
 
 def test_unknown_names_are_refused():

@@ -76,6 +76,20 @@ def checked_effects(given: Any) -> tuple[Effect, ...]:
     return listed
 
 
+def checked_units(given: Any) -> Units:
+    """The units of the ports, checked; a pair such as `("m", "N")` is taken too."""
+    entries = checks.entries(given)
+    if entries is not None and 2 <= len(entries) <= len(TURNING):
+        units = Units(*entries)
+        words, sizes = (units.motion, units.effort, units.input), (units.motion_size, units.effort_size)
+        if all(isinstance(w, str) and w for w in words) and all(checks.real(size) > 0 for size in sizes):
+            return units
+    raise InputError(
+        f"The units were given as {given!r}, but are those of a position and of a force or torque; write for "
+        'instance ("m", "N"), or Units("m", "N", input="A") for a machine that is driven by a current.'
+    )
+
+
 def process_noise_of(mechanism: "Mechanism", given: Any) -> dict[str, float]:
     """Port -> intensity of the process noise, checked; empty for None."""
     if not (given is None or isinstance(given, Mapping)):
@@ -204,7 +218,7 @@ class Mechanism:
         effects: Physical effects; inertias, springs, dampers and the motor among them.
         outputs: Channel -> port (its position) or (port, "speed").
         trusted: Full names `port.effect.parameter` of the parameters that a fit holds at their values.
-        units: Units of the ports; rotary by default.
+        units: Units of the ports, such as ("m", "N"), see `Units`; ("rad", "N m") by default.
         signals: Names of the measured signals that may drive effects in addition to the input. The signals
             that the effects name are added.
 
@@ -231,6 +245,7 @@ class Mechanism:
         put("effects", checked_effects(self.effects))
         put("outputs", checked_outputs(self.outputs))
         put("trusted", frozenset(checks.names(self.trusted, "trusted")))
+        put("units", checked_units(self.units))
         known = (*checks.names(self.signals, "signals"), *(e.signal for e in self.effects if e.signal))
         put("signals", tuple(dict.fromkeys(known)))
         check_parts(self)

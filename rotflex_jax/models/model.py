@@ -421,7 +421,7 @@ def check_units_of_file(mechanism: Mechanism, recording: Recording) -> None:
         raise InputError(
             f"{recording.source}: the input {recording.input_name!r} is in {recording.input_unit}, but the "
             f"model is driven in {driven}; name the column of that with input=, give a model with such an "
-            "input (for a current one with CurrentDrive), or pass accept=('units',)."
+            "input (for a current one with CurrentDrive and Units(input='A')), or pass accept=('units',)."
         )
     for channel, unit in output_units(mechanism).items():
         given = recording.unit(channel) if channel in recording.channels else unit
