@@ -15,6 +15,7 @@ from test_cli import assert_one_sentence, run  # noqa: F401 - a fixture
 
 import rotflex_jax as rf
 from rotflex_jax.data.datasets import demo_recording
+from rotflex_jax.mechanism import Units
 
 RECORDING = demo_recording().slice(0, 2000)
 T, U = RECORDING.t, RECORDING.u
@@ -241,6 +242,57 @@ def test_it_is_refused(case: str, run, tmp_path: Path) -> None:  # noqa: F811
     status, _, err = run(first, file, *options)
     assert status == 2
     assert_one_sentence(err, named)
+
+
+CART = """
+from rotflex_jax import Mechanism
+from rotflex_jax.effects import CurrentDrive, Inertia, Viscous
+
+cart = Mechanism(
+    coordinates=["x"],
+    ports={"cart": (1,)},
+    effects=[CurrentDrive("cart", gain=2.0), Inertia("cart", inertia=4.0), Viscous("cart", coefficient=1.0)],
+    outputs={"x": "cart"},
+    trusted=["cart.current_drive.gain"],
+    units=("m", "N"),
+)
+"""
+
+
+@pytest.mark.parametrize(
+    ("column", "option"),
+    [("Lage [mm]", "x=Lage [mm]"), ("Lage [mm]", "x [mm]=Lage"), ("Lage", "x [mm]=Lage"), ("x [mm]", "")],
+)
+def test_millimetres_are_converted_for_a_model_in_metres(
+    column: str,
+    option: str,
+    run,  # noqa: F811
+    tmp_path: Path,
+) -> None:
+    position = np.cumsum(np.cumsum(U))
+    position /= np.abs(position).max()  # [m]
+    (tmp_path / "plant.py").write_text(CART)
+    file = as_csv(pd.DataFrame({"t": T, "voltage": U, column: 1e3 * position}))(tmp_path)
+    where = ["--joint", f"{tmp_path / 'plant.py'}:cart", *(["--output", option] if option else [])]
+    status, _, err = run("simulate", file, *where, "--save", tmp_path / "out.csv")
+    assert status == 0, err
+    found = pd.read_csv(tmp_path / "out.csv")
+    measured = next(c for c in found if c.startswith("x"))
+    np.testing.assert_allclose(found[measured], position, rtol=1e-8)
+
+
+def test_millimetres_are_no_metres_for_a_model_in_python(tmp_path: Path) -> None:
+    cart = rf.Mechanism(
+        coordinates=("x",),
+        ports={"cart": (1,)},
+        effects=(rf.effects.CurrentDrive("cart"), rf.effects.Inertia("cart"), rf.effects.Viscous("cart")),
+        outputs={"x": "cart"},
+        trusted=("cart.current_drive.gain",),
+        units=Units("m", "N"),
+    )
+    recording = rf.Recording(u=U, y=1e3 * THETA, Ts=0.002, channels="x", units="mm")
+    with pytest.raises(rf.InputError, match=r"is in mm, but .* is in m; multiply it by 0.001, or"):
+        rf.fit(cart, recording)
 
 
 def test_the_documentation_lists_them_all() -> None:

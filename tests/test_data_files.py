@@ -365,6 +365,24 @@ def test_a_unit_of_the_file_is_not_called_radians(tmp_path: Path) -> None:
             load(path, **options)
 
 
+@pytest.mark.parametrize(
+    ("header", "given", "factor"),
+    [("mm", "m", 1e-3), ("cm/s", "m/s", 1e-2), ("µm", "m", 1e-6), ("mrad", "rad", 1e-3)],
+)
+def test_a_prefix_of_the_file_is_converted_if_the_unit_without_it_is_given(
+    header: str, given: str, factor: float, tmp_path: Path
+) -> None:
+    path = write_text(tmp_path / "run.csv", f"t,voltage,x [{header}],alpha [rad]")
+    found = load(path, outputs={"x": "x"}, units={"x": given})
+    assert found.units == (given,)
+    np.testing.assert_allclose(found.y[:, 0], factor * Y[:, 0], rtol=1e-14)
+    kept = load(path, outputs={"x": "x"}, units={"x": header})
+    assert kept.units == (header,)
+    np.testing.assert_array_equal(kept.y[:, 0], Y[:, 0])
+    with pytest.raises(InputError, match="but was given in"):
+        load(path, outputs={"x": "x"}, units={"x": "km"})
+
+
 @pytest.mark.parametrize("unit", ["ns", "min", "h"])
 def test_a_time_in_a_unit_that_is_not_read_is_refused(unit: str, tmp_path: Path) -> None:
     path = write_text(tmp_path / "run.csv", f"t [{unit}],voltage,theta,alpha")

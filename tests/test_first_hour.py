@@ -594,10 +594,10 @@ def test_one_angle_in_degrees_and_one_in_radians(run, tmp_path) -> None:  # noqa
     assert [str(f) for f in late.remarks if f.kind == "converted"] == [
         "The time 't_ms' was converted from ms because of its name."
     ]
-    milli = ("--output", "theta [mrad]=servo", "--output", "alpha=arm")
-    status, _, err = run("check", tmp_path / "plain.csv", *milli)
+    strange = ("--output", "theta [gon]=servo", "--output", "alpha=arm")
+    status, _, err = run("check", tmp_path / "plain.csv", *strange)
     assert status == 2
-    assert_one_sentence(err, "'theta' is in mrad, but that of the model is in rad")
+    assert_one_sentence(err, "'theta' is in gon, but that of the model is in rad")
     twice = ("--output", "theta=servo", "--output", "theta=arm")
     status, _, err = run("check", tmp_path / "plain.csv", *twice)
     assert status == 2

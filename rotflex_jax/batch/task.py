@@ -25,7 +25,7 @@ from rotflex_jax.discover.explanation import Explanation, remaining_failures
 from rotflex_jax.effects import CATALOG
 from rotflex_jax.errors import InputError
 from rotflex_jax.joints.by_name import imported
-from rotflex_jax.models.model import Model, check_units_of_file
+from rotflex_jax.models.model import Model, in_units_of
 from rotflex_jax.recording import Recording
 from rotflex_jax.runtime.xla import enable_fast_start
 
@@ -194,8 +194,7 @@ def _searched(task: SearchTask) -> Any:
     if isinstance(source, Recording):
         recording = source
     else:
-        recording = load(source, **task.reading)
-        check_units_of_file(model.mechanism, recording)
+        recording = in_units_of(model.mechanism, load(source, **task.reading))
     found = search(model, *recording.split(task.share))
     return {"result": found.to_dict(), "model": _model(found), "page": _page(found) if task.pages else None}
 

@@ -108,12 +108,10 @@ class Columns:
         if not file.exists():
             raise InputError(f"{file} does not exist; give the path of a recording.")
         from rotflex_jax.data import load
-        from rotflex_jax.models.model import check_units_of_file
+        from rotflex_jax.models.model import in_units_of
 
         recording = load(file, **self.reading())
-        if self.mechanism is not None:
-            check_units_of_file(self.mechanism, recording)
-        return recording
+        return recording if self.mechanism is None else in_units_of(self.mechanism, recording)
 
     def reading(self) -> dict[str, Any]:
         """The options as arguments of `rotflex_jax.load`."""

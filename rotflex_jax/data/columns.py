@@ -13,11 +13,13 @@ from rotflex_jax.errors import InputError
 from rotflex_jax.recording.quality import SLOWEST_SAMPLING, Finding, is_absolute, whole_numbers
 from rotflex_jax.recording.samples import (
     DEGREES,
+    UNIT_SIZES,
     even_spacing,
     finite,
     in_radians,
     real_numbers,
     sampling_period,
+    unit_factor,
 )
 
 OTHER_NAMES = {"t": ("time",), "theta": ("θ",), "alpha": ("α",)}
@@ -54,7 +56,7 @@ COUNT_UNITS = frozenset({"count", "counts", "cnt", "cnts", "tick", "ticks"})
 OTHER_UNITS = COUNT_UNITS | {
     *("mrad", "urad", "µrad", "μrad", "rev", "revs", "turn", "turns", "gon", "grad", "rpm"),
     *("mdeg", "arcmin", "arcsec"),
-    *("m", "cm", "mm", "um", "µm", "μm", "inch", "m/s", "mm/s", "v", "mv", "ma"),
+    *("m", "cm", "mm", "um", "µm", "μm", "inch", "m/s", "cm/s", "mm/s", "v", "mv", "ma"),
 }
 """Lower-case units of outputs other than radians and degrees; other words in brackets are remarks."""
 
@@ -267,7 +269,7 @@ def output(
     counts: float | None,
     accepted: Sequence[str],
 ) -> tuple[Real[np.ndarray, " N"], str]:
-    """An output and its unit: angles and speeds in degrees or counts are converted, all else is unchanged.
+    """An output and its unit: converted from degrees or counts, or to a given unit without the file's prefix.
 
     Args:
         table: Table with the column.
@@ -289,13 +291,14 @@ def output(
             f"{label} is in {said} by its {source}, but counts={counts:g} of one turn were given; leave the "
             "counts out, or name the column with the counts."
         )
-    if unit is not None and not (turned or unit.startswith("rad")):
+    factor = 1.0 if "units" in accepted else _prefix_factor(stated_unit(table, name), unit)
+    if unit is not None and (factor != 1.0 or not (turned or unit.startswith("rad"))):
         if degrees or counts is not None:
             raise InputError(
                 f"{label} was to be converted to rad, but its unit is given as "
                 f"{unit!r}; leave out the unit, or the conversion (degrees, counts)."
             )
-        return values, unit
+        return (values if factor == 1.0 else values * factor), unit
     if counts is not None:
         if turned:
             raise InputError(
@@ -334,6 +337,13 @@ def output(
     return np.deg2rad(values), turned or unit or own
 
 
+def _prefix_factor(own: str, given: str | None) -> float:
+    """Factor from the unit of the file to the one that is given; 1 unless a prefix is all that is dropped."""
+    if given is None or given.partition("/")[0].strip() not in UNIT_SIZES:
+        return 1.0
+    return unit_factor(own, given) or 1.0
+
+
 def _own_radians(unit: str) -> str:
     """The unit in radians, or in radians per time, of a column with a unit in radians or degrees."""
     angle, slash, time = unit.partition("/")
@@ -345,6 +355,8 @@ def _check_other_unit(table: Table, channel: str, name: str, given: str | None, 
     """Refuses a column that by the file is in neither radians nor degrees, unless its unit is given."""
     own = stated_unit(table, name)
     if own.lower() not in OTHER_UNITS or (given or "").lower() == own.lower():
+        return
+    if _prefix_factor(own, given) != 1.0:
         return
     said = f"{table.label}: column {name!r} is in {own} by its {_unit_source(name, own)}"
     if given is not None:

@@ -264,7 +264,8 @@ def load(
         time: column of the time [s].
         accept: faults to accept by name, such as `saturated`; see `Recording`.
         units: mapping of channel to unit, for units other than rad; `deg` and `deg/s` are converted to rad
-            and rad/s. Also of the column of the input to its unit, if that is not V.
+            and rad/s, and a column that the file has in mm, cm, um or mrad to m or rad, if that is given.
+            Also of the column of the input to its unit, if that is not V.
         max_bytes: largest size of the file, packed and unpacked [bytes].
         counts: counts per turn, if the outputs are counts of an encoder; or a mapping of channel to counts
             per turn, where the other channels are angles.

@@ -22,7 +22,7 @@ from rotflex_jax.metrics import window_starts
 from rotflex_jax.recording import Recording
 from rotflex_jax.recording.quality import ACCEPTABLE
 from rotflex_jax.recording.recording import single
-from rotflex_jax.recording.samples import in_radians
+from rotflex_jax.recording.samples import in_radians, unit_factor
 from rotflex_jax.runtime.persistent_jit import PersistentJit, persistent_jit
 from rotflex_jax.runtime.xla import double_precision
 
@@ -184,9 +184,15 @@ class Model:
                 f"has the channels {', '.join(recording.channels)}; name the column of {missing[0]}, "
                 f"outputs={{{missing[0]!r}: 'COLUMN'}}, or give a model with the outputs of the recording."
             )
-        for channel in self.mechanism.channels:
+        for channel, unit in output_units(self.mechanism).items():
             given = recording.unit(channel)
-            if in_radians(given) and (unit := output_units(self.mechanism)[channel]).startswith("rad"):
+            if unit_factor(given, unit) not in (None, 1.0):
+                raise InputError(
+                    f"Channel {channel!r} of the recording is in {given}, but the output {channel} of the "
+                    f"model is in {unit}; multiply it by {unit_factor(given, unit):g}, or load the file with "
+                    f"units={{{channel!r}: {unit!r}}}, which converts it where the file names its unit."
+                )
+            if in_radians(given) and unit.startswith("rad"):
                 raise InputError(
                     f"Channel {channel!r} of the recording is in {given}, but the output {channel} of the "
                     f"model is in {unit}; convert it (numpy.deg2rad), or load the file with "
@@ -406,11 +412,12 @@ def units_to_read(mechanism: Mechanism, input: str | None = None) -> dict[str, s
     return units if input is None or mechanism.units.input == "V" else {**units, input: mechanism.units.input}
 
 
-def check_units_of_file(mechanism: Mechanism, recording: Recording) -> None:
-    """Refuses a recording of a file whose input, outputs and signals are not those of the mechanism.
+def in_units_of(mechanism: Mechanism, recording: Recording) -> Recording:
+    """A recording of a file in the units of the mechanism; one of another machine is refused.
 
-    `Model.measured` refuses an angle in degrees for radians alone, since a recording made in Python may name
-    its units as it likes. Here any other unit is refused: a file is read by those of the mechanism.
+    Outputs whose units differ by a prefix alone, such as mm and m, are converted. `Model.measured` refuses
+    such units and degrees alone, since a recording made in Python may name its units as it likes. Here any
+    other unit is refused: a file is read by those of the mechanism.
 
     Raises:
         InputError: The input or an output has another unit, which the recording does not accept, or a signal
@@ -423,16 +430,29 @@ def check_units_of_file(mechanism: Mechanism, recording: Recording) -> None:
             f"model is driven in {driven}; name the column of that with input=, give a model with such an "
             "input (for a current one with CurrentDrive and Units(input='A')), or pass accept=('units',)."
         )
+    factors, changed = dict.fromkeys(recording.channels, 1.0), {}
     for channel, unit in output_units(mechanism).items():
         given = recording.unit(channel) if channel in recording.channels else unit
-        if given != unit and not any_unit:
+        if given == unit or any_unit:
+            continue
+        factor = unit_factor(given, unit)
+        if factor is None:
             raise InputError(
                 f"{recording.source}: the output {channel!r} is in {given}, but that of the model is in "
                 f"{unit}; convert the column, or pass accept=('units',)."
             )
+        factors[channel], changed[channel] = factor, unit
     if lacking := [name for name in mechanism.signals if name not in recording.signals]:
         has = " and ".join(map(repr, recording.signals)) or "none"
         raise InputError(
             f"{recording.source}: the model is driven by the signal {lacking[0]!r} beside its input, but the "
             f"signals that were read are {has}; name its column, signals={{{lacking[0]!r}: 'COLUMN'}}."
         )
+    if not changed:
+        return recording
+    y = recording.y * [factors[channel] for channel in recording.channels]
+    units = [changed.get(c, unit) for c, unit in zip(recording.channels, recording.units, strict=True)]
+    converted = dataclasses.replace(recording, y=y, units=units, resolution=None)
+    of_file = [f for f in recording.findings if f.kind == "cut"]  # of the file alone: not among the remarks
+    vars(converted)["findings"] = (*converted.findings, *of_file)
+    return converted

@@ -332,6 +332,26 @@ def in_radians(unit: str) -> str | None:
     return f"rad{slash}{time}" if angle.strip().lower() in DEGREES else None
 
 
+UNIT_SIZES = {
+    "m": {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "μm": 1e-6},
+    "rad": {"rad": 1.0, "mrad": 1e-3, "urad": 1e-6, "µrad": 1e-6, "μrad": 1e-6},
+}
+"""Unit of a motion -> this unit and those with a prefix, with their sizes in it."""
+
+
+def unit_factor(given: str, wanted: str) -> float | None:
+    """Factor from one unit of a motion to another, if they differ by a prefix alone; None for other units.
+
+    >>> unit_factor("mm/s", "m/s"), unit_factor("m", "m"), unit_factor("mm", "rad"), unit_factor("V", "V")
+    (0.001, 1.0, None, None)
+    """
+    (one, *time), (other, *other_time) = given.split("/", 1), wanted.split("/", 1)
+    for sizes in UNIT_SIZES.values():
+        if one.strip() in sizes and other.strip() in sizes and time == other_time:
+            return sizes[one.strip()] / sizes[other.strip()]
+    return None
+
+
 def known_signals(
     given: Mapping[str, Any] | None, u: Float[np.ndarray, " N"], taken: Sequence[str]
 ) -> Mapping[str, Float[np.ndarray, " N"]]:
