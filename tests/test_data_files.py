@@ -366,21 +366,32 @@ def test_a_unit_of_the_file_is_not_called_radians(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("header", "given", "factor"),
-    [("mm", "m", 1e-3), ("cm/s", "m/s", 1e-2), ("µm", "m", 1e-6), ("mrad", "rad", 1e-3)],
+    ("column", "unit", "given", "factor"),
+    [
+        ("x [mm]", "mm", "m", 1e-3),
+        ("x [cm/s]", "cm/s", "m/s", 1e-2),
+        ("x [µm]", "µm", "m", 1e-6),
+        ("x [mrad]", "mrad", "rad", 1e-3),
+        ("x [rpm]", "rpm", "rad/s", np.pi / 30),
+        ("x [1/min]", "1/min", "rad/s", np.pi / 30),
+        ("x_mm", "mm", "m", 1e-3),
+        ("x_rpm", "rpm", "rad/s", np.pi / 30),
+    ],
 )
-def test_a_prefix_of_the_file_is_converted_if_the_unit_without_it_is_given(
-    header: str, given: str, factor: float, tmp_path: Path
+def test_the_unit_of_the_file_is_converted_to_the_one_that_is_given(
+    column: str, unit: str, given: str, factor: float, tmp_path: Path
 ) -> None:
-    path = write_text(tmp_path / "run.csv", f"t,voltage,x [{header}],alpha [rad]")
-    found = load(path, outputs={"x": "x"}, units={"x": given})
+    path = write_text(tmp_path / "run.csv", f"t,voltage,{column},alpha [rad]")
+    found = load(path, outputs={"x": column}, units={"x": given})
     assert found.units == (given,)
     np.testing.assert_allclose(found.y[:, 0], factor * Y[:, 0], rtol=1e-14)
-    kept = load(path, outputs={"x": "x"}, units={"x": header})
-    assert kept.units == (header,)
+    note = f"Column {column!r} was converted from {unit} because of its name."
+    assert [str(f) for f in found.remarks if f.kind == "converted"] == [note] * ("[" not in column)
+    kept = load(path, outputs={"x": column}, units={"x": unit})
+    assert kept.units == (unit,)
     np.testing.assert_array_equal(kept.y[:, 0], Y[:, 0])
-    with pytest.raises(InputError, match="but was given in"):
-        load(path, outputs={"x": "x"}, units={"x": "km"})
+    with pytest.raises(InputError, match=f"is in {unit} by its name, but an output is taken in rad unless"):
+        load(path, outputs={"x": column})
 
 
 @pytest.mark.parametrize("unit", ["ns", "min", "h"])

@@ -13,6 +13,7 @@ from rotflex_jax.errors import InputError
 from rotflex_jax.recording.quality import SLOWEST_SAMPLING, Finding, is_absolute, whole_numbers
 from rotflex_jax.recording.samples import (
     DEGREES,
+    TURNS_PER_MINUTE,
     UNIT_SIZES,
     even_spacing,
     finite,
@@ -54,11 +55,14 @@ INPUT_UNITS = {"V": {"v", "volt", "volts", "voltage"}, "A": {"a", "amp", "ampere
 
 COUNT_UNITS = frozenset({"count", "counts", "cnt", "cnts", "tick", "ticks"})
 OTHER_UNITS = COUNT_UNITS | {
-    *("mrad", "urad", "µrad", "μrad", "rev", "revs", "turn", "turns", "gon", "grad", "rpm"),
+    *("mrad", "urad", "µrad", "μrad", "rev", "revs", "turn", "turns", "gon", "grad", *TURNS_PER_MINUTE),
     *("mdeg", "arcmin", "arcsec"),
     *("m", "cm", "mm", "um", "µm", "μm", "inch", "m/s", "cm/s", "mm/s", "v", "mv", "ma"),
 }
 """Lower-case units of outputs other than radians and degrees; other words in brackets are remarks."""
+
+OUTPUT_UNITS_IN_NAMES = ("mm", "cm", "um", "µm", "μm", "mrad", "rpm")
+"""Units that are read at the end of the name of an output, as in `x_mm`."""
 
 
 UNITS_IN_NAMES = {*TIME_UNITS, *TIME_WORDS, *OTHER_TIMES, *OTHER_UNITS}.union(*INPUT_UNITS.values()) | {
@@ -162,6 +166,12 @@ def _with_unit(table: Table, column: str) -> str:
 def stated_unit(table: Table, column: str) -> str:
     """The unit in brackets after the name of a column, or in the line of units; empty if there is none."""
     return name_and_unit(column)[1] or table.units.get(column, "").strip(" []()")
+
+
+def _own_unit(table: Table, column: str) -> str:
+    """The unit of an output that the file states, or with which its name ends; empty if there is none."""
+    last = re.findall(r"[^\W\d_]+", spaced(name_and_unit(column)[0]))[-1:]
+    return stated_unit(table, column) or "".join(w for w in last if w.lower() in OUTPUT_UNITS_IN_NAMES)
 
 
 def column_of(table: Table, name: str, argument: str, wrong: Mapping[str, str]) -> Real[np.ndarray, " N"]:
@@ -269,7 +279,7 @@ def output(
     counts: float | None,
     accepted: Sequence[str],
 ) -> tuple[Real[np.ndarray, " N"], str]:
-    """An output and its unit: converted from degrees or counts, or to a given unit without the file's prefix.
+    """An output and its unit: converted from degrees, counts, or the file's unit to a given one in m or rad.
 
     Args:
         table: Table with the column.
@@ -291,7 +301,7 @@ def output(
             f"{label} is in {said} by its {source}, but counts={counts:g} of one turn were given; leave the "
             "counts out, or name the column with the counts."
         )
-    factor = 1.0 if "units" in accepted else _prefix_factor(stated_unit(table, name), unit)
+    factor = 1.0 if "units" in accepted else _factor_to_base(_own_unit(table, name), unit)
     if unit is not None and (factor != 1.0 or not (turned or unit.startswith("rad"))):
         if degrees or counts is not None:
             raise InputError(
@@ -337,8 +347,8 @@ def output(
     return np.deg2rad(values), turned or unit or own
 
 
-def _prefix_factor(own: str, given: str | None) -> float:
-    """Factor from the unit of the file to the one that is given; 1 unless a prefix is all that is dropped."""
+def _factor_to_base(own: str, given: str | None) -> float:
+    """Factor from the unit of the file to the given one, if that is m, rad or their speed; otherwise 1."""
     if given is None or given.partition("/")[0].strip() not in UNIT_SIZES:
         return 1.0
     return unit_factor(own, given) or 1.0
@@ -353,10 +363,10 @@ def _own_radians(unit: str) -> str:
 
 def _check_other_unit(table: Table, channel: str, name: str, given: str | None, degrees: bool) -> None:
     """Refuses a column that by the file is in neither radians nor degrees, unless its unit is given."""
-    own = stated_unit(table, name)
+    own = _own_unit(table, name)
     if own.lower() not in OTHER_UNITS or (given or "").lower() == own.lower():
         return
-    if _prefix_factor(own, given) != 1.0:
+    if _factor_to_base(own, given) != 1.0:
         return
     said = f"{table.label}: column {name!r} is in {own} by its {_unit_source(name, own)}"
     if given is not None:
@@ -452,21 +462,22 @@ def time_unit_of(table: Table, name: str, by_name: bool = True) -> tuple[str | N
     return None, ""
 
 
-def conversions_by_name(table: Table, outputs: Mapping[str, str], clock: str) -> list[Finding]:
+def conversions_by_name(table: Table, turned: Mapping[str, str], said: set[str], clock: str) -> list[Finding]:
     """Notes on columns that were converted because of their names alone, which the file does not confirm.
 
     Args:
         table: Table with the columns.
-        outputs: Channel -> column, for outputs whose unit the user has not given.
+        turned: Channel -> column, for outputs that were converted.
+        said: Channels whose unit the user has given.
         clock: Column of the time; empty if the user has given its unit, or the sampling period.
     """
-    notes = [
-        Finding(
-            "converted", channel, f"Column {name!r} was converted from degrees because of its name.", "note"
-        )
-        for channel, name in outputs.items()
-        if not stated_unit(table, name) and _angle_unit(table, name)[0] == "deg"
-    ]
+    notes = []
+    for channel, name in turned.items():
+        angle = "degrees" if channel not in said and _angle_unit(table, name)[0] == "deg" else ""
+        unit = angle or _own_unit(table, name)
+        if unit and not stated_unit(table, name):
+            message = f"Column {name!r} was converted from {unit} because of its name."
+            notes.append(Finding("converted", channel, message, "note"))
     unit = time_unit_of(table, clock)[0] if clock and not stated_unit(table, clock) else None
     if unit not in (None, "s"):
         message = f"The time {clock!r} was converted from {unit} because of its name."

@@ -378,10 +378,10 @@ def load(
     if arm_absolute:
         y = deflection(y, table.label, accepted)
     said = set(chosen) if degrees else {*per_turn, *(units or {})}
-    unsaid = {c: name for c, name in chosen.items() if c in turned - said}
     read = stamps and time_unit is None and "units" not in accepted
     remarks = unused_sensors(table, tuple(y), {clock, *names})
-    remarks += conversions_by_name(table, unsaid, clock if read else "")
+    converted_from = {c: name for c, name in chosen.items() if c in turned}
+    remarks += conversions_by_name(table, converted_from, said, clock if read else "")
     if apart:
         if resample is None:
             raise InputError(

@@ -338,17 +338,32 @@ UNIT_SIZES = {
 }
 """Unit of a motion -> this unit and those with a prefix, with their sizes in it."""
 
+TURNS_PER_MINUTE = ("rpm", "1/min", "u/min", "r/min", "rev/min")
+"""Spellings of revolutions per minute in lower case."""
+
 
 def unit_factor(given: str, wanted: str) -> float | None:
-    """Factor from one unit of a motion to another, if they differ by a prefix alone; None for other units.
+    """Factor from one unit of a length, an angle or their speeds to another; None for other units.
+
+    Degrees are not among them, see `in_radians`.
 
     >>> unit_factor("mm/s", "m/s"), unit_factor("m", "m"), unit_factor("mm", "rad"), unit_factor("V", "V")
     (0.001, 1.0, None, None)
+    >>> unit_factor("rpm", "rad/s") * 60 / (2 * math.pi)
+    1.0
     """
-    (one, *time), (other, *other_time) = given.split("/", 1), wanted.split("/", 1)
-    for sizes in UNIT_SIZES.values():
-        if one.strip() in sizes and other.strip() in sizes and time == other_time:
-            return sizes[one.strip()] / sizes[other.strip()]
+    one, other = _in_base(given), _in_base(wanted)
+    return one[1] / other[1] if one and other and one[0] == other[0] else None
+
+
+def _in_base(unit: str) -> tuple[str, float] | None:
+    """The unit without a prefix, and the size in it; None for a unit that is not of a length or an angle."""
+    if unit.lower() in TURNS_PER_MINUTE:
+        return "rad/s", 2 * math.pi / 60
+    motion, slash, time = unit.partition("/")
+    for base, sizes in UNIT_SIZES.items():
+        if motion.strip() in sizes:
+            return base + slash + time, sizes[motion.strip()]
     return None
 
 
