@@ -40,6 +40,17 @@ def test_a_sign_turned_round_is_named(signs: dict[str, float], sentence: str) ->
         rf.discover(JOINT, good, bad)
 
 
+def test_of_several_recordings_the_one_with_the_wrong_sign_is_named() -> None:
+    good, bad = recorded(), recorded(theta=-1)
+    with pytest.raises(rf.InputError, match=r"input in recording 2 of 3 .* negate the column of theta there"):
+        check_signs(JOINT, [good, bad, good])
+    named = dataclasses.replace(bad, source="monday.csv")
+    with pytest.raises(rf.InputError, match=r"input in monday\.csv \(correlation"):
+        rf.fit(JOINT, [good, named])
+    with pytest.raises(rf.InputError, match=r"under this input \(correlation"):
+        check_signs(JOINT, [bad, named])
+
+
 @pytest.mark.parametrize("kind", ["noise", "multisine", "prbs", "steps", "sweep"])
 def test_right_signs_pass_whatever_the_input(kind: str) -> None:
     check_signs(JOINT, [recorded(kind=kind)])

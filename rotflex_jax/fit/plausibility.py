@@ -106,28 +106,34 @@ def check_signs(model: Model, recordings: Sequence[Recording]) -> None:
         InputError: If channels move in the opposite direction.
     """
     against: set[str] = set()
-    worst = 0.0
-    for recording in (r for r in recordings if not r.signals):
+    there: dict[int, str] = {}  # number of a recording -> its name, where a channel moves against the model
+    compared, worst = 0, 0.0
+    for k, recording in enumerate(recordings):
+        if recording.signals:
+            continue
         linear = linearise(model.at(recording).mechanism)
         r = recording.slice(0, min(recording.N, MAX_SIGN_SAMPLES))
         y, would = model.measured(r).astype(float), _response(linear.discretise(r.Ts), linear.C, r.u)
         if not np.all(np.isfinite(would)):
             continue
+        compared += 1
         for channel, a, b in zip(model.mechanism.channels, y.T, would.T, strict=True):
             found = [_correlation(a, b, max(round(share * r.N), 1)) for share in MOVE_SHARES]
             if max(found) < OPPOSED_CORRELATION:
                 against.add(channel)
+                there[k] = recording.source or f"recording {k + 1} of {len(recordings)}"
                 worst = min(worst, *found)
     if not against:
         return
+    where = "" if len(there) == compared else f" in {' and '.join(dict.fromkeys(there.values()))}"
     every = against == set(model.mechanism.channels)
     names = " and ".join(c for c in model.mechanism.channels if c in against)
-    what = "the input" if every else f"the column of {names}"
+    what = ("the input" if every else f"the column of {names}") + (" there" if where else "")
     verb = "moves" if len(against) == 1 else "move"
     raise InputError(
-        f"{names} {verb} against what the model would do under this input (correlation {worst:.2f}), as with "
-        f"a sign turned round; negate {what} if that is so, or give starting values nearer to the machine, "
-        "such as model.with_values({...})."
+        f"{names} {verb} against what the model would do under this input{where} (correlation {worst:.2f}), "
+        f"as with a sign turned round; negate {what} if that is so, or give starting values nearer to the "
+        "machine, such as model.with_values({...})."
     )
 
 
