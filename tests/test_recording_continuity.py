@@ -232,3 +232,55 @@ def test_digests_do_not_know_the_new_faults() -> None:
     """Results are stored with digests of parts, which contain the accepted faults, so these are fixed."""
     assert quality.ACCEPTABLE[: len(quality.IN_DIGESTS)] == quality.IN_DIGESTS
     assert not set(NEW) & set(quality.IN_DIGESTS)
+
+
+# A speed that is held
+
+
+def motor_speed(levels: list[float], each: int = 400, rate: float = 10.0) -> np.ndarray:
+    """Speed of a motor after steps of its voltage, in closed form [rad/s]."""
+    speed, found = 0.0, []
+    fall = np.exp(-rate * TS * np.arange(1, each + 1))
+    for level in levels:
+        found.append(20.0 * level + (speed - 20.0 * level) * fall)
+        speed = found[-1][-1]
+    return np.concatenate(found)
+
+
+LEVELS = [0.0, 5.0, -5.0, 2.0, 0.0]
+STEPS_OF_VOLTAGE = np.repeat(LEVELS, 400)
+SPEED = motor_speed(LEVELS)
+NOISY = SPEED + np.random.default_rng(3).normal(0.0, 0.2, len(SPEED))
+
+
+def on_speed(x: np.ndarray) -> list[str]:
+    r = rf.Recording(u=STEPS_OF_VOLTAGE, y=x, Ts=TS, channels="speed", units="rad/s")
+    return [f.message for f in r.findings if f.severity != "note"]
+
+
+def test_a_speed_that_is_stuck_or_at_its_limit_is_named() -> None:
+    stuck = changed(NOISY, slice(900, None), NOISY[900])
+    (said,) = on_speed(stuck)
+    assert f"'speed' is exactly {NOISY[900]:g} rad/s from 2.25 to 4.9975 s" in said
+    (said,) = on_speed(np.clip(NOISY, -60.0, 60.0))
+    assert "'speed' is exactly 60 rad/s from 1.09 to" in said
+    frame = pd.DataFrame({"t": TS * np.arange(len(stuck)), "voltage": STEPS_OF_VOLTAGE, "speed": stuck})
+    assert "accept=('frozen',)" in refused(frame, outputs={"speed": "speed"}, units={"speed": "rad/s"})
+
+
+@pytest.mark.parametrize("step", [1e-9, 1e-3, 0.1, 2.0])
+def test_a_speed_that_settles_is_not_reported(step: float) -> None:
+    for x in (SPEED, NOISY):
+        assert on_speed(np.round(x / step) * step) == []
+
+
+def test_a_speed_that_friction_brings_to_rest_is_not_cut_off() -> None:
+    """It falls in proportion to the time and stops at once, here with the offset of a tacho or without."""
+    one_way = np.maximum(STEPS_OF_VOLTAGE, 0.0)
+    falls = SPEED[799] - 2.0 * np.arange(1, 1201)
+    x = np.concatenate([SPEED[:800], np.maximum(falls, 0.0)])
+    for offset, u in ((0.0, one_way), (1.3, one_way), (1.3, STEPS_OF_VOLTAGE)):
+        r = rf.Recording(u=u, y=x + offset, Ts=TS, channels="speed", units="rad/s")
+        assert [f.kind for f in r.findings if f.severity != "note"] == []
+    rectified = rf.Recording(u=STEPS_OF_VOLTAGE, y=np.maximum(SPEED, 0.0), Ts=TS, channels="w", units="rad/s")
+    assert [f.kind for f in rectified.findings if f.severity != "note"] == ["rectified"]

@@ -20,6 +20,12 @@ JUMP_FROM_REST = 3.0
 SHORTEST_STILL, SHORTEST_STILL_SECONDS = 20, 0.05
 """Least length of a frozen stretch in samples and in seconds, both of which must be met."""
 
+SHORTEST_HELD, SHORTEST_HELD_SECONDS = 50, 0.2
+"""The same for a speed that is held at one value."""
+
+NEAR_REST = 0.1
+"""Share of the largest speed up to which the reading of a tacho may be rest."""
+
 
 def motion(x: Float[np.ndarray, " N"]) -> float:
     """Largest motion of a signal from one sample to the next, without the steps of `MOST_OUTLIERS` outliers.
@@ -177,6 +183,35 @@ def frozen(u: Float[np.ndarray, " N"], y: Float[np.ndarray, "N C"], Ts: float) -
             if inside and min(steps[first - 1, c], steps[last, c]) > FAR_OUT * scale[c]:
                 found.append(Still(first, last, c, float(steps[last, c]), True))
     return min(found, default=None)
+
+
+def held_speed(x: Float[np.ndarray, " N"], step: float | None, Ts: float) -> tuple[int, int] | None:
+    """The first stretch in which a speed is held at one value, by a sensor that is stuck or at its limit.
+
+    A machine comes to a constant speed gradually, and to rest at once. So the value must be far from zero,
+    and the last samples before it must differ by far more than the resolution.
+
+    Args:
+        x: speed.
+        step: quantisation step of the speed, None if there is none.
+        Ts: sampling period [s].
+
+    Returns:
+        First and last sample of the stretch; None if there is none.
+
+    >>> x = 5 * np.sin(np.arange(2000) / 100)
+    >>> held_speed(np.minimum(x, 4.0), None, 0.002), held_speed(x, None, 0.002)
+    ((93, 221), None)
+    """
+    steps = np.abs(np.diff(x))
+    least = max(SHORTEST_HELD, round(SHORTEST_HELD_SECONDS / Ts))
+    rounding = max(10 * (step or 0.0), 1e-4 * float(np.ptp(x)))
+    for first, last in _constant(steps > 0, least):
+        before = steps[max(0, first - SHORTEST_STILL) : first]
+        moved = len(before) == SHORTEST_STILL and np.median(before) > rounding
+        if moved and abs(x[first]) > NEAR_REST * np.max(np.abs(x)):
+            return first, last
+    return None
 
 
 def _constant(moves: Bool[np.ndarray, " M"], least: int) -> list[tuple[int, int]]:

@@ -19,7 +19,17 @@ from jaxtyping import Bool, Complex, Float
 
 from rotflex_jax.checks import shown
 from rotflex_jax.errors import InputError
-from rotflex_jax.recording.continuity import Still, frozen, motion, outliers, unwrapped, without, wraps
+from rotflex_jax.recording.continuity import (
+    NEAR_REST,
+    Still,
+    frozen,
+    held_speed,
+    motion,
+    outliers,
+    unwrapped,
+    without,
+    wraps,
+)
 
 
 def quantisation_step(x: Float[np.ndarray, " N"]) -> float | None:
@@ -297,6 +307,8 @@ def inspect(
             continue
         step = resolution[name]
         found += [_quantised(name, unit, step), _cut_off(x, u, Ts, name, unit, step)]
+        if unit.endswith("/s"):
+            found.append(_held_speed(x, Ts, name, unit, step, start))
         if unit == "rad":
             found.append(_like_counts(x, name) or _like_degrees(x, u, Ts, name, units[0]))
     found += [_absolute_angle(y, names[1:]), _swapped(y, names[1:])]
@@ -449,6 +461,21 @@ def _frozen(
     message = (
         f"{what}: nothing was measured in that time; load the parts before and after it as recordings of "
         "their own, or pass accept=('frozen',)."
+    )
+    return Finding("frozen", name, message, "warning")
+
+
+def _held_speed(
+    x: Float[np.ndarray, " N"], Ts: float, name: str, unit: str, step: float | None, start: float
+) -> Finding | None:
+    held = held_speed(x, step, Ts)
+    if held is None:
+        return None
+    first, last = (start + k * Ts for k in held)
+    message = (
+        f"Channel {name!r} is exactly {x[held[0]]:g} {unit} from {first:.6g} to {last:.6g} s, but changed "
+        "from sample to sample before: the sensor is stuck or at its limit; load the parts before and after "
+        "it as recordings of their own, or pass accept=('frozen',)."
     )
     return Finding("frozen", name, message, "warning")
 
@@ -639,6 +666,15 @@ def _swapped(y: Float[np.ndarray, "N C"], names: Sequence[str]) -> Finding | Non
     return Finding("swapped", "alpha", message, "warning")
 
 
+def _may_rest(x: Float[np.ndarray, " N"], u: Float[np.ndarray, " N"], end: float) -> bool:
+    """Whether a speed at this end of its range may be rest, to which friction brings a machine at once.
+
+    A speed of exactly zero is its extreme also for a sensor without a sign, where the input has both signs.
+    """
+    both_signs = u.min() < 0 < u.max()
+    return abs(end) <= NEAR_REST * np.max(np.abs(x)) and not (end == 0 and both_signs)
+
+
 def _cut_off(
     x: Float[np.ndarray, " N"],
     u: Float[np.ndarray, " N"],
@@ -648,7 +684,7 @@ def _cut_off(
     step: float | None,
 ) -> Finding | None:
     end, count = cut_off(x, step, u, Ts) or (None, 0)
-    if end is None:
+    if end is None or (unit.endswith("/s") and _may_rest(x, u, end)):
         return None
     where = f"is exactly {end:g} {unit}, its extreme, in {count} of {len(x)} samples"
     if end == 0:
