@@ -116,6 +116,18 @@ def test_simulators_with_their_certificates(run, saved, tmp_path):
     assert status == 0 and "level = 0.0312 N m" in out
 
 
+def test_a_controller_of_a_machine_without_a_hub_is_told_its_port(run, tmp_path):
+    file = tmp_path / "axis_on_rail.py"
+    file.write_text("from rotflex_jax.joints import emps\n\naxis = emps()\n")
+    where = ("export", f"{file}:axis", "--to", "controller", "--Ts", "0.002")
+    status, out, err = run(*where)
+    assert (status, out) == (2, "")
+    one_sentence(err, "--port must be one of 'axis'")
+    status, out, err = run(*where, "--port", "axis")
+    assert (status, err) == (0, "") and "Controller of axis" in out
+    one_sentence(run("export", f"{file}:axis", "--to", "text", "--port", "axis")[2], "text has no use of it")
+
+
 def test_what_cannot_be_exported_is_said_in_one_sentence(run, saved, tmp_path):
     for arguments, words in (
         ((saved, "--to", "fortran"), ("'fortran'", "c, latex, text, statespace")),

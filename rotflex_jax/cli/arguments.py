@@ -234,6 +234,9 @@ Prefix = Annotated[
         help="What the names in the C code begin with: rotflex, those of a controller control, unless given.",
     ),
 ]
+ControlledPort = Annotated[
+    str, typer.Option("--port", metavar="PORT", help="Port whose position a controller moves.")
+]
 PendulumLength = Annotated[
     float, typer.Option("--length", metavar="M", help="Length of the servo's pendulum, for bam.")
 ]

@@ -75,6 +75,7 @@ def simulate(
 USED_IN = {
     "Ts": ("c", "statespace", "controller", *given.SIMULATORS),
     "prefix": ("c", "controller"),
+    "port": ("controller",),
     "length": ("bam",),
     "actuator": ("bam",),
 }
@@ -88,6 +89,7 @@ def export(
     Ts: given.ExportPeriod = None,
     prefix: given.Prefix = None,
     effects: given.OwnEffects = None,
+    port: given.ControlledPort = "hub",
     length: given.PendulumLength = 0.1,
     actuator: given.ServoName = "xl330",
 ) -> None:
@@ -136,7 +138,7 @@ def export(
     elif form == "controller":
         from rotflex_jax.control import controller, controller_to_c
 
-        text = controller_to_c(controller(subject, float(period or 0)), prefix=prefix)
+        text = controller_to_c(controller(subject, float(period or 0), port=port), prefix=prefix)
     elif form == "statespace":
         text = json.dumps(forms.state_space(subject, period).to_dict(), indent=2) + "\n"
     else:
