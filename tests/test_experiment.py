@@ -2,6 +2,7 @@
 
 import dataclasses
 import re
+import warnings
 
 import jax.numpy as jnp
 import numpy as np
@@ -108,6 +109,14 @@ def test_a_model_reproduces_its_own_run(problem):
     wrong = a.start.copy()
     wrong[: len(a.free)] += 0.05
     assert fit_rival(a, u, free_run_from_rest(a, u, Ts), Ts, wrong).nats < 0.05
+
+
+def test_a_rival_whose_errors_overflow_is_refused_without_a_warning(problem):
+    b = problem.pair[1]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = fit_rival(b, noise(N, Ts, seed=1), np.full((N, len(b.mechanism.channels)), 1e200), Ts)
+    assert found.nats == np.inf
 
 
 def test_with_process_noise_an_innovation_is_weaker_evidence():
@@ -315,7 +324,7 @@ def test_a_machine_in_metres_is_told_in_metres():
         noise={"position": 1e-5},
         improve=False,
     )
-    assert re.search(r"slew to [\d.]+ V/s, position to [\d.]+ m predicted", str(e))
+    assert re.search(r"slew to [\d.]+ V/s, position to [\d.]+ mm predicted", str(e))
     assert "position [mm]" in {ax.get_ylabel() for ax in e.plot().axes}
 
 

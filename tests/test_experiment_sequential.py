@@ -425,7 +425,7 @@ def test_a_machine_in_metres_is_told_in_metres(tmp_path):
     assert (found.best, found.runs[0].units, found.runs[0].input_unit) == ("rough", ("m",), "V")
     assert [ax.get_ylabel() for ax in found.plot().axes][1:] == ["voltage [V]", "position [mm]"]
     s = rf.next_experiment(models, limits=limits, seconds=2.0, Ts=0.01, noise=noise, improve=False)
-    assert re.search(r"voltage to [\d.]+ V, position to [\d.]+ m predicted", str(s))
+    assert re.search(r"voltage to [\d.]+ V, position to [\d.]+ mm predicted", str(s))
     assert [ax.get_ylabel() for ax in s.plot().axes] == ["voltage [V]", "position [mm]"]
     e = sequential_experiment(models, limits, 0.01, noise=noise, improve=False).with_next_segment()
     assert SequentialExperiment.load(e.save(tmp_path / "state.json")).planned.units == ("m",)
@@ -435,7 +435,7 @@ def test_a_goal_is_told_in_its_unit(tmp_path):
     servo, limits, noise = rf.joints.sts3215(), rf.Limits(voltage=0.5), {"theta": 1e-3}
     models = {"smooth": servo, "rough": servo + rf.effects.Coulomb("hub", level=0.05)}
     s = rf.next_experiment(models, limits=limits, seconds=4.0, Ts=0.02, noise=noise, improve=False)
-    assert re.search(r"input to [\d.]+ rad, theta to [\d.]+ rad predicted", str(s))
+    assert re.search(r"input to [\d.]+ rad, theta to [\d.]+ deg predicted", str(s))
     head, names, *_ = s.save_csv(tmp_path / "next.csv").read_text().splitlines()
     assert head.startswith("# t in s, input in rad,") and names == "t,input [rad]"
     assert s.plot().axes[0].get_ylabel() == "input [rad]"

@@ -15,7 +15,7 @@ from rotflex_jax.mechanism.quantity import input_word
 from rotflex_jax.recording import Recording
 from rotflex_jax.text.files import write_file
 from rotflex_jax.text.markup import bullets, card, paragraph, table
-from rotflex_jax.text.numbers import json_numbers, one_line
+from rotflex_jax.text.numbers import json_numbers, one_line, readable
 
 
 def voltage_file(
@@ -58,9 +58,9 @@ def json_limits(limits: Limits) -> dict[str, float | None]:
 
 
 def _predicted(peaks: dict[str, float], units: tuple[str, ...]) -> str:
-    """Largest predicted outputs, in words."""
-    listed = zip(peaks.items(), units, strict=True)
-    return ", ".join(f"{name} to {value:.3g} {unit}".rstrip() for (name, value), unit in listed)
+    """Largest predicted outputs in words, in the units of tables and limits, such as deg and mm."""
+    listed = ((name, *readable(peak, unit)) for (name, peak), unit in zip(peaks.items(), units, strict=True))
+    return ", ".join(f"{name} to {value:.3g} {unit}".rstrip() for name, value, unit in listed)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -286,6 +286,7 @@ def limits_of_unknowns(
     return np.concatenate([parameters, np.full(len(x) - len(bounded), np.inf)])
 
 
+@np.errstate(over="ignore", invalid="ignore")  # of a run that diverges, whose step is refused
 def fit_rival(
     rival: RivalModel,
     u: Float[np.ndarray, " N"],
