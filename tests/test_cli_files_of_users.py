@@ -244,6 +244,21 @@ def test_it_is_refused(case: str, run, tmp_path: Path) -> None:  # noqa: F811
     assert_one_sentence(err, named)
 
 
+def test_counts_of_one_column_beside_degrees_of_the_other(run, tmp_path: Path) -> None:  # noqa: F811
+    """Each refusal names an option that leads on, and the last one is accepted."""
+    frame = pd.DataFrame({"t": T, "voltage": U, "hub": counted(THETA), "tip [deg]": np.rad2deg(ALPHA)})
+    file = as_csv(frame)(tmp_path)
+    columns = ("--output", "hub", "--output", "tip")
+    status, _, err = run("check", file, *columns)
+    assert status == 2
+    assert_one_sentence(err, "counts of one turn, --counts 4096")
+    status, _, err = run("check", file, *columns, "--counts", "4096")
+    assert status == 2
+    assert_one_sentence(err, "'tip [deg]' is in deg by its name", "--counts theta=4096")
+    status, _, err = run("check", file, *columns, "--counts", "theta=4096")
+    assert status == 0, err
+
+
 CART = """
 from rotflex_jax import Mechanism
 from rotflex_jax.effects import CurrentDrive, Inertia, Viscous

@@ -298,8 +298,9 @@ def output(
     said, source = _angle_unit(table, name)
     if counts is not None and said and "units" not in accepted:
         raise InputError(
-            f"{label} is in {said} by its {source}, but counts={counts:g} of one turn were given; leave the "
-            "counts out, or name the column with the counts."
+            f"{label} is in {said} by its {source}, but counts={counts:g} of one turn were given; give the "
+            "counts of the channels that have them alone, such as counts={'theta': 4096}, or name the column "
+            "with the counts."
         )
     factor = 1.0 if "units" in accepted else _factor_to_base(_own_unit(table, name), unit)
     if unit is not None and (factor != 1.0 or not (turned or unit.startswith("rad"))):
