@@ -1,6 +1,7 @@
 """The grey-box fit on recordings of the arena's simulator, which shares no code with the model."""
 
 import dataclasses
+import re
 
 import numpy as np
 import pytest
@@ -206,6 +207,25 @@ def test_each_recording_has_an_offset_of_its_own():
     for rec, v in zip(recs, (0.15, -0.05), strict=True):
         alone = fit(joint, rec)
         assert alone[name].value == pytest.approx(v, abs=4 * alone[name].std)
+
+
+def test_the_recording_that_fits_worst_is_named():
+    """Three recordings of one inertia; the residual in each is the noise that was added to it."""
+    machine, rng, Ts = single_inertia(0.002, damping=0.01), np.random.default_rng(4), 0.005
+    recordings, noise = [], {"monday.csv": 5e-4, "tuesday.csv": 2e-2, "": 1e-3}
+    for source, sd in noise.items():
+        u = 2.0 * np.repeat(rng.standard_normal(40), 20)
+        y = simulate(machine, u, Ts) + rng.normal(0.0, sd, (len(u), 1))
+        recordings.append(Recording(u=u, y=y, Ts=Ts, channels="theta", source=source))
+    found = fit(machine, recordings, restarts=0)
+    assert [r.source for r in found.residuals] == list(noise)
+    assert [r.rms["theta"] for r in found.residuals] == pytest.approx(list(noise.values()), rel=0.1)
+    said = r"theta: .* rms, from 0\.0\d+ deg in monday.csv to 1\.\d+ deg in tuesday.csv\n"
+    assert re.search(said, str(found))
+    assert "monday.csv to 1." in found._repr_html_()
+    unnamed = fit(machine, [recordings[2], recordings[2]], restarts=0)
+    assert "in recording 1 to" in str(unnamed)
+    assert " from " not in str(fit(machine, recordings[:1], restarts=0))
 
 
 def test_windows_start_again_but_a_recording_keeps_its_own_offset():

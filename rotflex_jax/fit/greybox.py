@@ -24,7 +24,7 @@ from rotflex_jax.fit.inference import (
 )
 from rotflex_jax.fit.plausibility import Reach, at_bounds, beyond_recordings, check_signs, physical_ranges
 from rotflex_jax.fit.problem import RunLayout
-from rotflex_jax.fit.result import Fit, FitOptions
+from rotflex_jax.fit.result import Fit, FitOptions, RunResidual
 from rotflex_jax.mechanism import Mechanism
 from rotflex_jax.mechanism.mechanism import process_noise_of
 from rotflex_jax.models.model import Model
@@ -61,7 +61,7 @@ def report(
     model, data, point, windows = problem.model, problem.dataset.data, end.point, end.stage.windows
     m, coordinates, seen = model.mechanism, problem.coordinates(point, windows), data.seen > 0
     residual = np.concatenate([e[r, s] for r, s in enumerate(seen)])
-    deviation = np.sqrt(np.mean(residual**2, axis=0))
+    deviation = _rms(residual)
     scale = np.maximum(deviation, LEAST_SCALE * problem.dataset.noise)
     values, stretch = problem.physical(point)
     common = problem.common(values)
@@ -102,7 +102,15 @@ def report(
         Ts=problem.dataset.recordings[0].Ts,
         n_init=problem.dataset.recordings[0].n_init,
         data=digest_of_recordings(problem.dataset.recordings),
+        residuals=tuple(
+            RunResidual(run.source, dict(zip(m.channels, _rms(e[r, seen[r]]).tolist(), strict=True)))
+            for r, run in enumerate(problem.dataset.recordings)
+        ),
     )
+
+
+def _rms(e: Float[np.ndarray, "N C"]) -> Float[np.ndarray, " C"]:
+    return np.sqrt(np.mean(e**2, axis=0))
 
 
 def _combinations(

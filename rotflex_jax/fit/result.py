@@ -5,7 +5,7 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -60,6 +60,18 @@ class FitOptions:
     ranges: tuple[tuple[float, ...], tuple[float, ...]] | None = None
 
 
+class RunResidual(NamedTuple):
+    """Residual of a fit in one of its recordings.
+
+    Attributes:
+        source: Where the recording comes from.
+        rms: Channel -> root mean square of the residual [unit of the channel].
+    """
+
+    source: str
+    rms: dict[str, float]
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class Fit:
     """A fitted model and how it was reached.
@@ -82,6 +94,7 @@ class Fit:
         Ts: Sampling period of the first recording [s], which a saved model keeps; None if unknown.
         n_init: Number of first samples of the first recording that give its first state; None if unknown.
         data: Digest of the recordings, in their order; "" if unknown.
+        residuals: Residual in each recording, in their order; empty if unknown.
     """
 
     model: Model
@@ -99,6 +112,7 @@ class Fit:
     Ts: float | None = None
     n_init: int | None = None
     data: str = ""
+    residuals: tuple[RunResidual, ...] = ()
 
     @property
     def profile_advised(self) -> tuple[str, ...]:
@@ -175,10 +189,24 @@ class Fit:
         """
         return compare_plot(recording, self, seconds=seconds)
 
+    def _extremes(self, channel: str, unit: str) -> str:
+        """The recordings with the least and the largest residual, in words; empty for one recording."""
+        if len(self.residuals) < 2:
+            return ""
+        sources = [r.source for r in self.residuals]
+        names = [s if s and sources.count(s) == 1 else f"recording {k + 1}" for k, s in enumerate(sources)]
+        sizes = [r.rms[channel] for r in self.residuals]
+        least, largest = int(np.argmin(sizes)), int(np.argmax(sizes))
+        shown = (readable(sizes[k], unit) for k in (least, largest))
+        low, high = (f"{value:.3g} {read}".rstrip() for value, read in shown)
+        return f"from {low} in {names[least]} to {high} in {names[largest]}"
+
     def _repr_html_(self) -> str:
         """A card with the status of the fit, its residuals, and every parameter with unit and interval."""
         residuals, estimates, widths = [], [], []
-        for channel, own in output_units(self.model.mechanism).items():
+        units = output_units(self.model.mechanism)
+        extremes = [(channel, self._extremes(channel, own)) for channel, own in units.items()]
+        for channel, own in units.items():
             value, unit = readable(self.noise[channel], own)
             residuals.append((channel, unit, plain_number(value)))
         for e in sorted(self.parameters, key=lambda e: not e.free):
@@ -190,6 +218,7 @@ class Fit:
         return card(
             f"Fit: {self.ending}, cost {plain_number(self.cost, 4)} nat",
             table(("channel", "unit", "rms residual"), residuals, words=2),
+            *(paragraph(f"{channel}: {said}") for channel, said in extremes if said),
             table(("parameter", "unit", "", "value", "95 %"), estimates, words=3),
             *(paragraph(remark.sentence) for remark in self.remarks),
             picture(
@@ -202,6 +231,8 @@ class Fit:
         lines = [f"Fit: {self.ending}, cost {self.cost:.1f} nat"]
         for channel, own in output_units(self.model.mechanism).items():
             value, unit = readable(self.noise[channel], own)
-            lines.append(f"  residual {channel}: {f'{value:.3g} {unit}'.rstrip()} rms")
+            extremes = self._extremes(channel, own)
+            where = f", {extremes}" if extremes else ""
+            lines.append(f"  residual {channel}: {f'{value:.3g} {unit}'.rstrip()} rms{where}")
         lines += [f"  {e}" for e in self.parameters]
         return "\n".join(lines + [f"  {remark.sentence}" for remark in self.remarks])
