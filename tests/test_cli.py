@@ -336,6 +336,18 @@ def test_simulate_tells_errors_and_saves(run, recorded, tmp_path) -> None:
     assert f"Fit, where 100 % is perfect: theta {theta:.1f} %, alpha {alpha:.1f} %" in out
 
 
+def test_check_goes_on_after_a_file_that_is_refused(run, recorded, tmp_path) -> None:
+    """Each file has its lines, in the order given; the last sentence names those that were refused."""
+    turned = write(tmp_path / "turned.csv", DEMO * [1, 1, 1, -1])
+    missing = tmp_path / "missing.csv"
+    status, out, err = run("check", turned, missing, recorded)
+    assert status == 2
+    assert_one_sentence(err, "2 of 3 files were refused", f"{turned}, {missing};")
+    first, second = (line for line in out.splitlines() if line.startswith("error: "))
+    assert "negate the column of alpha" in first and f"{missing} does not exist" in second
+    assert out.endswith("The signs of theta and alpha do not contradict paper.\n")
+
+
 def test_check_lists_columns_that_are_not_read_beside_a_single_sensor(run, tmp_path) -> None:
     """The options in the note read both sensors. The note is no part of a result that is printed."""
     file = write(tmp_path / "tip.csv", DEMO, ("t", "voltage", "Theta [rad]", "tip angle"))

@@ -72,28 +72,46 @@ def check(
     joint = joint_for(files, given.one_model(joints), columns)
     model = by_name.model(joint)
     model, columns = columns.of(model)
+    refused = []
+    for file in files:
+        try:
+            for recording in columns.load_all([file]):
+                _say_what_is_in(recording, str(file), model, joint, named)
+        except InputError as error:
+            if len(files) == 1:
+                raise
+            refused.append(str(file))
+            terminal.message(f"error: {given.as_options(str(error))}")
+    if refused:
+        raise InputError(
+            f"{len(refused)} of {len(files)} files were refused, {', '.join(refused)}; the lines that begin "
+            "with error: say why."
+        )
+
+
+def _say_what_is_in(recording: "Recording", name: str, model: "Model", joint: str, named: bool) -> None:
+    """Print what was read, whether its signs agree with the model and, if it is named, what can be known."""
     from rotflex_jax.fit.plausibility import check_signs
 
-    for name, recording in ((str(file), r) for file in files for r in columns.load_all([file])):
-        terminal.print_recording(recording)
-        if recording.duration < SHORTEST_FOR_SEARCH:
-            terminal.message(
-                f"note: {recording.duration:g} s are little for a search; ten to twenty with many reversals "
-                "are right."
-            )
-        try:
-            check_signs(model, [recording])
-        except InputError as error:
-            raise InputError(f"{name}: {error}") from None
-        channels = " and ".join(model.mechanism.channels)
+    terminal.print_recording(recording)
+    if recording.duration < SHORTEST_FOR_SEARCH:
         terminal.message(
-            f"The signs of {channels} were not compared with {joint}, since a signal may move the machine "
-            "more than the input does."
-            if recording.signals
-            else f"The signs of {channels} do not contradict {joint}."
+            f"note: {recording.duration:g} s are little for a search; ten to twenty with many reversals "
+            "are right."
         )
-        if named:
-            _say_what_can_be_known(model, recording, joint)
+    try:
+        check_signs(model, [recording])
+    except InputError as error:
+        raise InputError(f"{name}: {error}") from None
+    channels = " and ".join(model.mechanism.channels)
+    terminal.message(
+        f"The signs of {channels} were not compared with {joint}, since a signal may move the machine "
+        "more than the input does."
+        if recording.signals
+        else f"The signs of {channels} do not contradict {joint}."
+    )
+    if named:
+        _say_what_can_be_known(model, recording, joint)
 
 
 def _say_what_can_be_known(model: "Model", recording: "Recording", joint: str) -> None:
