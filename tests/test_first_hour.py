@@ -232,6 +232,20 @@ def test_lost_rows_are_said_and_parts_of_the_recording_still_say_it() -> None:
         assert "about 3 rows are lost" in said[0].message
 
 
+def test_an_input_that_is_thinned_out_is_said_to_be_late() -> None:
+    """Reference: the phase of a sine of 4 Hz that is held at every fourth of its samples."""
+    t = 0.0005 * np.arange(4001)
+    u = np.sin(2 * np.pi * 4 * t)
+    table = pd.DataFrame({"t": t, "voltage": u, "theta": 0.1 * u, "alpha": 0.01 * np.cos(9 * t)})
+    found = rf.load(table, resample=0.002)
+    turn = np.exp(-2j * np.pi * 4 * t[:-1])
+    late = np.angle((u[:-1] @ turn) / (np.repeat(found.u, 4)[:4000] @ turn)) / (2 * np.pi * 4)
+    (said,) = (f for f in found.findings if f.kind == "resampled")
+    assert said.severity == "warning" and "of about 4 samples of the input one is used" in said.message
+    assert f"late by {1000 * late:.2g} ms" in said.message
+    assert [f.severity for f in rf.load(table, resample=0.0005).findings if f.kind == "resampled"] == ["note"]
+
+
 def test_a_long_gap_is_not_bridged() -> None:
     with pytest.raises(InputError, match="no resampling should bridge"):
         rf.load(frame().drop(range(700, 800)), resample="auto")

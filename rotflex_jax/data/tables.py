@@ -414,6 +414,9 @@ def _are_numbers(cells: list[str]) -> bool:
 # Step of the times, in median steps, above which rows are lost.
 LOST = 1.5
 
+# Samples of the input in each new period from which on it matters that one of them is used.
+THINNED = 1.5
+
 
 def resampled(
     t: Float[np.ndarray, " N"],
@@ -440,7 +443,7 @@ def resampled(
 
     Returns:
         First time and period [s], input, outputs, and a finding that states what was done: a note, or a
-        warning if rows are lost.
+        warning if rows are lost, or samples of the input are left out.
 
     Raises:
         InputError: The times decrease or are too few, or they have a gap that is too long to interpolate.
@@ -532,7 +535,14 @@ def resampled_apart(
         message += f"; about {lost} rows are lost, and lines bridge them"
     if repeated:
         message += f"; {repeated} rows with a time that was there before are left out"
-    finding = Finding("resampled", "time", f"{message}.", "warning" if lost else "note")
+    thinned = Ts / min((float(np.median(clocks[id(t)][1])) for t, _, held, _ in signals if held), default=Ts)
+    if thinned > THINNED:
+        message += (
+            f"; of about {thinned:.2g} samples of the input one is used, not their mean as by decimate(), so "
+            f"that it is late by {500 * (Ts - Ts / thinned):.2g} ms"
+        )
+    severity = "warning" if lost or thinned > THINNED else "note"
+    finding = Finding("resampled", "time", f"{message}.", severity)
     return start, Ts, found, finding
 
 
