@@ -120,13 +120,17 @@ def gains_in_words(candidate: ValidatedHypothesis, current: ValidatedHypothesis)
     return f"{line}; fitted to free runs: {error_ratio(ratio)} (z {z:.1f}, of training data {train_z:.1f})"
 
 
+# A free run whose error is this many times as large as before is called one that diverges.
+DIVERGED = 1e6
+
+
 def error_ratio(ratio: float) -> str:
     """How a free-run error compares with the one before.
 
-    >>> error_ratio(1.87), error_ratio(1.002), error_ratio(float("inf"))
+    >>> error_ratio(1.87), error_ratio(1.002), error_ratio(5e35)
     ('free-run error 1.9 times as large', 'free-run error unchanged', 'free runs diverge')
     """
-    if not np.isfinite(ratio):
+    if not ratio < DIVERGED:
         return "free runs diverge"
     times = f"{ratio:.2g}"
     return "free-run error unchanged" if times == "1" else f"free-run error {times} times as large"

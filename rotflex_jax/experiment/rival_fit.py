@@ -188,8 +188,10 @@ class RivalFit:
 
     @property
     def converged(self) -> bool:
-        """Whether a further step would gain almost nothing."""
-        return self.predicted_gain <= max(GAIN_SHARE_TOLERANCE * self.nats, GAIN_TOLERANCE)
+        """Whether a further step would gain almost nothing; False for a fit whose runs diverge."""
+        return bool(np.isfinite(self.nats)) and self.predicted_gain <= max(
+            GAIN_SHARE_TOLERANCE * self.nats, GAIN_TOLERANCE
+        )
 
 
 def free_run_from_rest(model: RivalModel, u: Float[np.ndarray, " N"], Ts: float) -> Float[np.ndarray, "N C"]:
