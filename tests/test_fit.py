@@ -328,7 +328,7 @@ def test_effects_that_are_switched_off_do_not_change_a_prediction():
         model.predict(rec, {"hub": 1e-4}, [1e-3, 1e-3])
         for model in (Model(large, gates=np.r_[np.ones(6), 0, 0]), Model(paper()))
     )
-    # The first states are fitted until a step gains nothing, to 1e-9 rad; switched on, an effect adds 0.007 rad.
+    # First states are fitted until a step gains nothing, to 1e-9 rad. Switched on, an effect adds 0.007 rad.
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-8)
 
 
