@@ -170,8 +170,13 @@ def stated_unit(table: Table, column: str) -> str:
 
 def _own_unit(table: Table, column: str) -> str:
     """The unit of an output that the file states, or with which its name ends; empty if there is none."""
-    last = re.findall(r"[^\W\d_]+", spaced(name_and_unit(column)[0]))[-1:]
-    return stated_unit(table, column) or "".join(w for w in last if w.lower() in OUTPUT_UNITS_IN_NAMES)
+    last = _last_word(column)
+    return stated_unit(table, column) or (last if last.lower() in OUTPUT_UNITS_IN_NAMES else "")
+
+
+def _last_word(column: str) -> str:
+    """The last word of the name of a column, without a unit in brackets; empty if it has none."""
+    return "".join(re.findall(r"[^\W\d_]+", spaced(name_and_unit(column)[0]))[-1:])
 
 
 def column_of(table: Table, name: str, argument: str, wrong: Mapping[str, str]) -> Real[np.ndarray, " N"]:
@@ -455,8 +460,8 @@ def time_stamps(
 
 def time_unit_of(table: Table, name: str, by_name: bool = True) -> tuple[str | None, str]:
     """Unit of a time by the unit in the file, or by the last word of the name; and where it is said."""
-    last = re.findall(r"[^\W\d_]+", spaced(name_and_unit(name)[0]).lower())[-1:] if by_name else []
-    for word in (stated_unit(table, name).lower(), *last):
+    last = _last_word(name).lower() if by_name else ""
+    for word in (stated_unit(table, name).lower(), last):
         unit = TIME_WORDS.get(word, word if word in TIME_UNITS else None)
         if unit is not None:
             return unit, _unit_source(name, word)

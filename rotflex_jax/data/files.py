@@ -54,7 +54,7 @@ from rotflex_jax.data.tables import (
 from rotflex_jax.errors import InputError
 from rotflex_jax.recording import Recording
 from rotflex_jax.recording.quality import DOUBTED, SLOWEST_SAMPLING, Finding, acceptable, converted
-from rotflex_jax.recording.recording import single
+from rotflex_jax.recording.recording import single, with_findings_on_file
 from rotflex_jax.recording.samples import real_numbers
 from rotflex_jax.text.files import path_of, write_file
 
@@ -441,10 +441,8 @@ def load(
         if finding.kind in DOUBTED and finding.kind not in accepted:
             worded = converted(finding) if finding.channel in turned else finding
             raise InputError(f"{table.label}: {worded.message}")
-    if table.cut:  # a finding on the file, not on parts of the recording
-        cut = Finding("cut", [*table.columns][-1], table.cut, "note")
-        vars(recording)["findings"] = (*recording.findings, cut)
-    return recording
+    cut = [Finding("cut", [*table.columns][-1], table.cut, "note")] if table.cut else []
+    return with_findings_on_file(recording, cut)
 
 
 def save_csv(recording: Recording, path: str | os.PathLike[str]) -> Path:

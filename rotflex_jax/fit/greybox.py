@@ -60,7 +60,8 @@ def report(
     """
     model, data, point, windows = problem.model, problem.dataset.data, end.point, end.stage.windows
     m, coordinates, seen = model.mechanism, problem.coordinates(point, windows), data.seen > 0
-    residual = np.concatenate([e[r, s] for r, s in enumerate(seen)])
+    of_runs = [e[r, s] for r, s in enumerate(seen)]
+    residual = np.concatenate(of_runs)
     deviation = _rms(residual)
     scale = np.maximum(deviation, LEAST_SCALE * problem.dataset.noise)
     values, stretch = problem.physical(point)
@@ -103,8 +104,8 @@ def report(
         n_init=problem.dataset.recordings[0].n_init,
         data=digest_of_recordings(problem.dataset.recordings),
         residuals=tuple(
-            RunResidual(run.source, dict(zip(m.channels, _rms(e[r, seen[r]]).tolist(), strict=True)))
-            for r, run in enumerate(problem.dataset.recordings)
+            RunResidual(run.source, dict(zip(m.channels, _rms(own).tolist(), strict=True)))
+            for run, own in zip(problem.dataset.recordings, of_runs, strict=True)
         ),
     )
 

@@ -21,7 +21,7 @@ from rotflex_jax.mechanism.simulate import first_state
 from rotflex_jax.metrics import window_starts
 from rotflex_jax.recording import Recording
 from rotflex_jax.recording.quality import ACCEPTABLE
-from rotflex_jax.recording.recording import single
+from rotflex_jax.recording.recording import single, with_findings_on_file
 from rotflex_jax.recording.samples import in_radians, unit_factor
 from rotflex_jax.runtime.persistent_jit import PersistentJit, persistent_jit
 from rotflex_jax.runtime.xla import double_precision
@@ -186,10 +186,10 @@ class Model:
             )
         for channel, unit in output_units(self.mechanism).items():
             given = recording.unit(channel)
-            if unit_factor(given, unit) not in (None, 1.0):
+            if (factor := unit_factor(given, unit)) not in (None, 1.0):
                 raise InputError(
                     f"Channel {channel!r} of the recording is in {given}, but the output {channel} of the "
-                    f"model is in {unit}; multiply it by {unit_factor(given, unit):g}, or load the file with "
+                    f"model is in {unit}; multiply it by {factor:g}, or load the file with "
                     f"units={{{channel!r}: {unit!r}}}, which converts it where the file names its unit."
                 )
             if in_radians(given) and unit.startswith("rad"):
@@ -453,6 +453,4 @@ def in_units_of(mechanism: Mechanism, recording: Recording) -> Recording:
     y = recording.y * [factors[channel] for channel in recording.channels]
     units = [changed.get(c, unit) for c, unit in zip(recording.channels, recording.units, strict=True)]
     converted = dataclasses.replace(recording, y=y, units=units, resolution=None)
-    of_file = [f for f in recording.findings if f.kind == "cut"]  # of the file alone: not among the remarks
-    vars(converted)["findings"] = (*converted.findings, *of_file)
-    return converted
+    return with_findings_on_file(converted, [f for f in recording.findings if f.kind == "cut"])

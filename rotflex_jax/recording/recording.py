@@ -610,6 +610,12 @@ def listed_if_given(recordings: Any, name: str, shortest: int = 1) -> tuple[Reco
     return () if none else listed(recordings, name, shortest)
 
 
+def with_findings_on_file(recording: Recording, found: Sequence[Finding]) -> Recording:
+    """The recording with further findings on the file as a whole, which its parts do not keep."""
+    vars(recording)["findings"] = (*recording.findings, *found)
+    return recording
+
+
 def single(recording: Any, name: str = "recording", shortest: int = 1) -> Recording:
     """The one recording that was given, alone or in a list.
 
