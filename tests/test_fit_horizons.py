@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import small_problem as sp
 from scipy.linalg import expm
-from scipy.optimize import least_squares, lsq_linear
+from scipy.optimize import least_squares, lsq_linear, minimize
 from scipy.signal import lfilter
 
 import rotflex_jax.effects as fx
@@ -172,6 +172,31 @@ def test_a_damper_beside_a_motor_may_take_away_what_the_motor_has_too_much():
     slow = paper(inductance=2e-4)
     k = slow.parameter_names.index("hub.viscous.coefficient")
     assert physical_ranges(slow)[0][k] * slow.parameter_specifications[k].typical == pytest.approx(-motor)
+
+
+@pytest.mark.parametrize(
+    ("run", "seconds"),
+    [
+        (lambda: linear_run(0.0015, emf=0.9), 0.5),
+        (lambda: recorded([("coulomb", "hub")], seconds=4.0)[0], 1.0),
+    ],
+    ids=["complete", "without friction"],
+)
+def test_no_parameters_have_smaller_errors_from_first_states_measured_with_them(run, seconds):
+    """Reference: Powell's method on errors over windows, whose first states every model fits to the data."""
+    rec = run()
+    found = fit(paper(stiffness=1.3), rec, first="measured", window_seconds=seconds, restarts=0)
+    names = found.free_names
+    at, std = (np.array([getattr(found[n], what) for n in names]) for what in ("value", "std"))
+
+    def cost(z: np.ndarray) -> float:
+        values = dict(zip(names, (at + z * std).tolist(), strict=True))
+        model = dataclasses.replace(found.model, mechanism=found.model.mechanism.with_values(values))
+        errors = model.simulate_windows(rec, seconds) - rec.y
+        return float(rec.N * np.sum(np.log(np.sqrt(np.mean(errors**2, axis=0)))))
+
+    here = np.zeros(len(names))
+    assert cost(here) - minimize(cost, here, method="Powell", options={"maxiter": 6}).fun < 0.05  # nats
 
 
 def test_windows_are_driven_by_the_voltage_of_the_whole_recording():

@@ -90,7 +90,8 @@ def finer_steps(
         shift = step / np.sqrt(np.diag(covariance))
     if not np.any(np.abs(shift) > LARGE_SHIFT):
         return None
-    moved = problem.errors_alone(coordinates.moved(end.point, step), end.stage, end.K)
+    there = problem.with_shown_states(coordinates.moved(end.point, step), end.stage)
+    moved = problem.errors_alone(there, end.stage, end.K)
     cost = min(_cost(problem, fine), _cost(problem, moved))
     return FinerSteps(solver, shift, _cost(problem, e) - cost)
 

@@ -230,8 +230,10 @@ def fit(
             state.
         process_noise: Port -> intensity of the process noise [(N m)^2 s]; None for a free run.
         local: Full names of parameters that have a value for each recording, such as an offset.
-        first: "fitted" to fit first states; "measured" to hold them at what the first `n_init` samples show.
-            Where nothing returns the machine to a position, fitted first states hide a drift of the model.
+        first: "fitted" to fit first states to all samples; "measured" to fit those of each set of parameters
+            to the first `n_init` samples alone, as a simulation of a recording does. Then the slopes of the
+            errors contain `dx0/dp = -(Jx'Jx)^-1 Jx'Jp`, over these samples. Where nothing returns the machine
+            to a position, fitted first states hide a drift of the model.
         window_seconds: Length of windows after which free runs start again [s], each time from a first state
             of its own: the parameters are then the best ones for free runs of this length. Delays and lags
             continue across windows, and memories start from the values that a run over the whole recording
@@ -362,11 +364,13 @@ def _problem(
 ) -> GreyBoxProblem:
     m = model.mechanism
     mesh = mesh_of(devices)
-    states = 2 * len(m.coordinates) if first == "fitted" else 0
+    measured = first == "measured"
+    states = 0 if measured and minimiser is not None else 2 * len(m.coordinates)
     return GreyBoxProblem(
         model,
         prepare(model, recordings, length=padded_length(recordings)),
         RunLayout(m.structure, model.solver, states, mesh if len(recordings) > 1 else None),
+        measured,
         physical_ranges(m),
         max_steps,
         restarts,

@@ -24,6 +24,7 @@ from rotflex_jax.fit.problem import (
     likelihood_equations,
     runs,
     runs_with_slopes,
+    with_measured_starts,
 )
 from rotflex_jax.mechanism import kalman_gains
 from rotflex_jax.mechanism.assembly import rest_state
@@ -54,9 +55,10 @@ LAST_STAGE_TOLERANCE, EARLY_STAGE_TOLERANCE = 1e-3, 1.0
 # towards a bound.
 PROGRESS_STEPS, LEAST_PROGRESS = 8, 0.1
 
-# Measured first states, and memories from a run over the whole recording, depend on the parameters. The last
-# stage is repeated with new ones until the cost converges: least and largest number of repetitions, and the
-# least gain that is worth a further one [nats that count].
+# Measured first states, and memories from a run over the whole recording, depend on the parameters. Within
+# a minimisation the former follow to first order and the latter are held. The last stage is repeated with new
+# ones until the cost converges: least and largest number of repetitions, and the least gain that is worth a
+# further one [nats that count].
 LEAST_REPETITIONS, MOST_REPETITIONS, SETTLED = 2, 6, 0.1
 
 # Least scale of a channel, as a share of the sensor noise.
@@ -182,6 +184,7 @@ class GreyBoxProblem:
         model: Mechanism and solver.
         dataset: The recordings.
         layout: Static data for which runs are compiled.
+        measured: Whether first states are not fitted, but those that the first samples show.
         ranges: Least and largest unconstrained value of each parameter.
         max_steps: Largest number of iterations of a minimisation.
         restarts: Largest number of restarts.
@@ -194,6 +197,7 @@ class GreyBoxProblem:
     model: Model
     dataset: Dataset
     layout: RunLayout
+    measured: bool
     ranges: tuple[Float[np.ndarray, " P"], Float[np.ndarray, " P"]]
     max_steps: int
     restarts: int
@@ -236,7 +240,8 @@ class GreyBoxProblem:
 
     def coordinates(self, point: FitPoint, windows: Windows) -> FitCoordinates:
         """The coordinates of the fit."""
-        return FitCoordinates(len(point.free), len(point.local), self.layout.states, windows)
+        states = 0 if self.measured else self.layout.states
+        return FitCoordinates(len(point.free), len(point.local), states, windows)
 
     def attempt(self, point: FitPoint, stages: Sequence[FitStage]) -> FitAttempt:
         """Fit one stage after the other, from a start; stages before the last end with a coarse tolerance."""
@@ -248,7 +253,7 @@ class GreyBoxProblem:
                 point = self._at_windows(point, stage.windows)
             follows, best = self._follows(stage), None
             renews = stage.process_noise is not None
-            point, K = self._with_shown_states(point, stage), self._gains(point, stage)
+            point, K = self.with_shown_states(point, stage), self._gains(point, stage)
             for repetition in range(MOST_REPETITIONS if last and (follows or renews) else 1):
                 found = self._minimum(
                     point, stage, K, LAST_STAGE_TOLERANCE if last else EARLY_STAGE_TOLERANCE
@@ -260,7 +265,7 @@ class GreyBoxProblem:
                     start_error = found.first.scale / self._spread
                 if follows:
                     # The run from the first states that belong to these parameters counts.
-                    point = self._with_shown_states(point, stage)
+                    point = self.with_shown_states(point, stage)
                 if renews:  # likewise the prediction with the gain that belongs to them
                     K = self._gains(point, stage)
                 if follows or renews:
@@ -303,7 +308,7 @@ class GreyBoxProblem:
         self, point: FitPoint, stage: FitStage, K: Float[np.ndarray, "R n C"]
     ) -> LikelihoodEquations:
         """Negative log-likelihood at a point and its quadratic model."""
-        e, J = self.errors(point, stage, K)
+        e, J, starts = self._linearised(point, stage, K)
         return likelihood_equations(
             self.coordinates(point, stage.windows),
             e,
@@ -311,14 +316,22 @@ class GreyBoxProblem:
             self.dataset.data.seen,
             LEAST_SCALE * self.dataset.noise,
             self._distances_to_bounds(point, stage.windows),
+            starts,
         )
 
     def errors(
         self, point: FitPoint, stage: FitStage, K: Float[np.ndarray, "R n C"]
     ) -> tuple[Float[np.ndarray, "R N C"], Float[np.ndarray, "R N C D"]]:
         """Errors of the runs and their slopes, bent in a robust fit; zero where a sample does not count."""
+        e, J, _ = self._linearised(point, stage, K)
+        return e, J
+
+    def _linearised(
+        self, point: FitPoint, stage: FitStage, K: Float[np.ndarray, "R n C"]
+    ) -> tuple[np.ndarray, np.ndarray, Float[np.ndarray, "R W m K"] | None]:
+        """Errors and slopes as in `errors`, and the slopes of first states that follow the parameters."""
         values, slopes = self.physical(point)
-        moved = np.array((*point.free, *point.local))
+        moved, starts = np.array((*point.free, *point.local)), None
         inputs = self._run_inputs(point, stage, K)
         y_hat, J = _joined(
             [
@@ -326,9 +339,16 @@ class GreyBoxProblem:
                 for rows, given in inputs
             ]
         )
+        if self.measured:
+            J, of_states = J[..., : len(moved)], J[..., len(moved) :]
+            if self.layout.states and stage.process_noise is None:
+                n_init = [recording.n_init for recording in self.dataset.recordings]
+                J, starts = with_measured_starts(J, of_states, stage.windows, n_init)
         seen = self.dataset.data.seen[:, :, None] > 0
         e, J = np.where(seen, y_hat - self.dataset.data.y, 0.0), np.where(seen[..., None], J, 0.0)
-        return (e, J) if self.bend is None else bent(e, J, self.bend)
+        if self.bend is not None:
+            e, J = bent(e, J, self.bend)
+        return e, J, starts
 
     def errors_alone(
         self, point: FitPoint, stage: FitStage, K: Float[np.ndarray, "R n C"]
@@ -492,9 +512,7 @@ class GreyBoxProblem:
     def _follows(self, stage: FitStage) -> bool:
         """Whether first states, or some of them, are not fitted but follow from the parameters."""
         unseen = len(rest_state(self.model.mechanism.structure, np.float64)) > self._moving
-        return not self.layout.states or (
-            unseen and stage.windows.number > 1 and max(stage.windows.counts) > 1
-        )
+        return self.measured or (unseen and stage.windows.number > 1 and max(stage.windows.counts) > 1)
 
     @property
     def _moving(self) -> int:
@@ -506,7 +524,7 @@ class GreyBoxProblem:
         x0[..., : self._moving] = windows.first_states
         return dataclasses.replace(point, x0=x0)
 
-    def _with_shown_states(self, point: FitPoint, stage: FitStage) -> FitPoint:
+    def with_shown_states(self, point: FitPoint, stage: FitStage) -> FitPoint:
         """The point with measured first states, where these are not fitted, and memories from a whole run."""
         if not self._follows(stage):
             return point
@@ -514,7 +532,7 @@ class GreyBoxProblem:
         for r, recording in enumerate(self.dataset.recordings):
             there = self.model_at(point, r)
             begins = np.array([samples.start for _, samples in stage.windows.of(r)])
-            moving = x0[r, : len(begins), : self._moving] if self.layout.states else None
+            moving = None if self.measured else x0[r, : len(begins), : self._moving]
             x0[r, : len(begins)] = there.states_at(recording, begins, moving)
         return dataclasses.replace(point, x0=x0)
 
@@ -557,15 +575,32 @@ class GreyBoxProblem:
             return minimise_by(self.minimiser, self, point, stage, K)
         coordinates = self.coordinates(point, stage.windows)
 
+        following: dict[int, Float[np.ndarray, "R W m K"] | None] = {}
+
+        def linearised(at: FitPoint) -> LikelihoodEquations:
+            found = self.equations(at, stage, K)
+            following[id(at)] = found.starts
+            return found
+
+        def moved(at: FitPoint, step: Float[np.ndarray, " M"]) -> FitPoint:
+            end, slopes = coordinates.moved(at, step), following[id(at)]
+            if slopes is None:
+                return end
+            x0 = at.x0.copy()
+            for r, count in enumerate(stage.windows.counts):
+                own = step[coordinates.columns(r, 0)]  # parameters, the same in all windows of the recording
+                x0[r, :count, : self._moving] += slopes[r, :count] @ own
+            return dataclasses.replace(end, x0=x0)
+
         def tell(progress: Progress) -> None:
             self.say(f"fit: {progress.evaluations} steps, cost {progress.cost:.1f} nat")
 
         return minimise(
-            lambda at: self.equations(at, stage, K),
+            linearised,
             point,
             Rules(enough=tolerance, window=PROGRESS_STEPS, least_progress=LEAST_PROGRESS),
             limit=self._limit(point, stage.windows),
-            move=coordinates.moved,
+            move=moved,
             unit=lambda equations: equations.nats_that_count,
             max_steps=self.max_steps,
             report=tell,

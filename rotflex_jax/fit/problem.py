@@ -23,7 +23,7 @@ from jax.sharding import Mesh
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from rotflex_jax.fit.coordinates import FitCoordinates
-from rotflex_jax.fit.dataset import StackedRecordings
+from rotflex_jax.fit.dataset import StackedRecordings, Windows
 from rotflex_jax.fit.inference import RecordingSlopes, curvature, flattened, nats_that_count
 from rotflex_jax.mechanism import Mechanism, Solver, predictor_run
 from rotflex_jax.mechanism.assembly import Layout, rest_state, whole_state
@@ -284,6 +284,55 @@ def channel_scale(
     return np.maximum(np.sqrt(2 * costs / samples), floor)
 
 
+# A direction of a first state that changes the first samples by no more than this share of the others is not
+# determined by them, and does not follow the parameters.
+UNDETERMINED = 1e-6
+
+
+def with_measured_starts(
+    J: Float[np.ndarray, "R N C K"],
+    of_states: Float[np.ndarray, "R N C m"],
+    windows: Windows,
+    n_init: Sequence[int],
+) -> tuple[Float[np.ndarray, "R N C K"], Float[np.ndarray, "R W m K"]]:
+    """Slopes of runs whose first states are those of least squares on their first samples.
+
+        dx0/dp = -(Jx'Jx)^-1 Jx'Jp over the first samples,   J = Jp + Jx dx0/dp
+
+    This is the derivative of the first state by the parameters but for second derivatives of the run, which
+    the small errors of the first samples multiply.
+
+    Args:
+        J: Slopes `Jp` by the parameters, with first states held.
+        of_states: Slopes `Jx` by the entries of the first state of the window of each sample.
+        windows: The windows.
+        n_init: Number of first samples of each recording.
+
+    Returns:
+        The slopes, and the slopes of the first states.
+    """
+    starts, total = np.zeros((len(J), windows.number, of_states.shape[-1], J.shape[-1])), J.copy()
+    for r, count in enumerate(n_init):
+        each = [samples for _, samples in windows.of(r)]
+        head = np.array([samples.start for samples in each])[:, None] + np.arange(count)
+        # A window may be shorter than the first samples.
+        own = (windows.index[r, head] == np.arange(len(each))[:, None])[..., None, None]
+        Jp, Jx = (
+            np.where(own, slopes[r, head], 0.0).reshape(len(each), -1, slopes.shape[-1])
+            for slopes in (J, of_states)
+        )
+        if not (np.isfinite(Jx).all() and np.isfinite(Jp).all()):
+            continue  # the run diverges, and its cost refuses it
+        size = np.linalg.norm(Jx, axis=1, keepdims=True)
+        size = np.where(size > 0, size, 1.0)
+        starts[r, : len(each)] = -(np.linalg.pinv(Jx / size, rcond=UNDETERMINED) @ Jp) / np.swapaxes(
+            size, 1, 2
+        )
+        for k, samples in enumerate(each):
+            total[r, samples] += of_states[r, samples] @ starts[r, k]
+    return total, starts
+
+
 @dataclasses.dataclass(frozen=True)
 class LikelihoodEquations:
     """Negative log-likelihood of errors, without constants, and its quadratic model at one point.
@@ -301,6 +350,7 @@ class LikelihoodEquations:
         lower: How far each coordinate may move down to a bound, zero or negative.
         upper: How far each coordinate may move up to a bound, zero or positive.
         parts: Scaled errors and slopes of each window.
+        starts: Slopes of measured first states by the parameters; None if first states do not follow them.
     """
 
     cost: float
@@ -311,6 +361,7 @@ class LikelihoodEquations:
     lower: Float[np.ndarray, " M"]
     upper: Float[np.ndarray, " M"]
     parts: Sequence[RecordingSlopes]
+    starts: Float[np.ndarray, "R W m K"] | None = None
 
     @functools.cached_property
     def nats_that_count(self) -> float:
@@ -377,6 +428,7 @@ def likelihood_equations(
     seen: Shaped[np.ndarray, "R N"],
     floor: Float[np.ndarray, " C"],
     to_bounds: tuple[Float[np.ndarray, " M"], Float[np.ndarray, " M"]],
+    starts: Float[np.ndarray, "R W m K"] | None = None,
 ) -> LikelihoodEquations:
     """Likelihood and its quadratic model from errors and slopes.
 
@@ -387,6 +439,7 @@ def likelihood_equations(
         seen: Not zero where a sample counts.
         floor: Least scale of each channel.
         to_bounds: How far each coordinate may move down and up.
+        starts: Slopes of measured first states by the parameters, if the slopes contain them.
     """
     cost, scale = negative_log_likelihood(e, int(np.count_nonzero(seen)), floor)
     with np.errstate(over="ignore", invalid="ignore"):
@@ -397,4 +450,4 @@ def likelihood_equations(
     inner = np.arange(coordinates.size) >= coordinates.shared
     for r in range(len(e)):
         inner[coordinates.local_columns(r)] = False
-    return LikelihoodEquations(cost, scale, g, H, inner, *to_bounds, parts)
+    return LikelihoodEquations(cost, scale, g, H, inner, *to_bounds, parts, starts)
