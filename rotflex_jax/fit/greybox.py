@@ -246,7 +246,8 @@ def fit(
         restarts: Largest number of restarts of a fit to free runs; 0 for none, which is several times as
             fast. Fits to predictions and robust fits have none.
         minimiser: Solver of optimistix that replaces the toolkit's own Levenberg-Marquardt, for instance
-            `optimistix.Dogleg(rtol=1e-6, atol=1e-6)`.
+            `optimistix.Dogleg(rtol=1e-6, atol=1e-6)`. It holds measured first states; they are measured again
+            before it is called again.
         devices: Devices of this process among which several recordings are divided; all of them if None,
             unless `jax.default_device` names one.
         progress: Called with a line of text now and then.
