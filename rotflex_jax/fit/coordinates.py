@@ -123,14 +123,28 @@ class FitCoordinates:
                     )
         return found
 
-    def moved(self, h: PointType, step: Float[np.ndarray, " M"]) -> PointType:
-        """The point after a step in these coordinates."""
+    def moved(
+        self,
+        h: PointType,
+        step: Float[np.ndarray, " M"],
+        starts: Float[np.ndarray, "R W m K"] | None = None,
+    ) -> PointType:
+        """The point after a step in these coordinates.
+
+        Args:
+            h: The point.
+            step: The step.
+            starts: Slopes by the parameters of first states that are no coordinates and follow these; None if
+                they are held.
+        """
         z, local_z, x0 = h.z.copy(), h.local_z.copy(), h.x0.copy()
         z[list(h.free[: self.shared])] += step[: self.shared]
         for r, count in enumerate(self.windows.counts):
             local_z[r] += step[self.local_columns(r)]
             for k in range(count):
                 x0[r, k, : self.states] += step[self.state_columns(r, k)]
+            if starts is not None:  # without coordinates of states, all windows have the same columns
+                x0[r, :count, : starts.shape[2]] += starts[r, :count] @ step[self.columns(r, 0)]
         return dataclasses.replace(h, z=z, local_z=local_z, x0=x0)
 
     def step_limit(self, each: Float[np.ndarray, " P"]) -> Float[np.ndarray, " M"]:

@@ -128,6 +128,14 @@ class FitPoint:
     x0: Float[np.ndarray, "R W n"]
 
 
+@dataclasses.dataclass
+class _LinearisedPoint:
+    """A point during a minimisation, with the slopes of its measured first states once it was run."""
+
+    point: FitPoint
+    starts: Float[np.ndarray, "R W m K"] | None = None
+
+
 @dataclasses.dataclass(frozen=True)
 class FitStage:
     """One stage of a fit: free runs of some length, or predictions.
@@ -309,15 +317,15 @@ class GreyBoxProblem:
     ) -> LikelihoodEquations:
         """Negative log-likelihood at a point and its quadratic model."""
         e, J, starts = self._linearised(point, stage, K)
-        return likelihood_equations(
+        found = likelihood_equations(
             self.coordinates(point, stage.windows),
             e,
             J,
             self.dataset.data.seen,
             LEAST_SCALE * self.dataset.noise,
             self._distances_to_bounds(point, stage.windows),
-            starts,
         )
+        return dataclasses.replace(found, starts=starts)
 
     def errors(
         self, point: FitPoint, stage: FitStage, K: Float[np.ndarray, "R n C"]
@@ -575,33 +583,22 @@ class GreyBoxProblem:
             return minimise_by(self.minimiser, self, point, stage, K)
         coordinates = self.coordinates(point, stage.windows)
 
-        following: dict[int, Float[np.ndarray, "R W m K"] | None] = {}
-
-        def linearised(at: FitPoint) -> LikelihoodEquations:
-            found = self.equations(at, stage, K)
-            following[id(at)] = found.starts
+        def linearised(at: _LinearisedPoint) -> LikelihoodEquations:
+            found = self.equations(at.point, stage, K)
+            at.starts = found.starts
             return found
-
-        def moved(at: FitPoint, step: Float[np.ndarray, " M"]) -> FitPoint:
-            end, slopes = coordinates.moved(at, step), following[id(at)]
-            if slopes is None:
-                return end
-            x0 = at.x0.copy()
-            for r, count in enumerate(stage.windows.counts):
-                own = step[coordinates.columns(r, 0)]  # parameters, the same in all windows of the recording
-                x0[r, :count, : self._moving] += slopes[r, :count] @ own
-            return dataclasses.replace(end, x0=x0)
 
         def tell(progress: Progress) -> None:
             self.say(f"fit: {progress.evaluations} steps, cost {progress.cost:.1f} nat")
 
-        return minimise(
+        found = minimise(
             linearised,
-            point,
+            _LinearisedPoint(point),
             Rules(enough=tolerance, window=PROGRESS_STEPS, least_progress=LEAST_PROGRESS),
             limit=self._limit(point, stage.windows),
-            move=moved,
+            move=lambda at, step: _LinearisedPoint(coordinates.moved(at.point, step, at.starts)),
             unit=lambda equations: equations.nats_that_count,
             max_steps=self.max_steps,
             report=tell,
         )
+        return dataclasses.replace(found, x=found.x.point)

@@ -428,7 +428,6 @@ def likelihood_equations(
     seen: Shaped[np.ndarray, "R N"],
     floor: Float[np.ndarray, " C"],
     to_bounds: tuple[Float[np.ndarray, " M"], Float[np.ndarray, " M"]],
-    starts: Float[np.ndarray, "R W m K"] | None = None,
 ) -> LikelihoodEquations:
     """Likelihood and its quadratic model from errors and slopes.
 
@@ -439,7 +438,6 @@ def likelihood_equations(
         seen: Not zero where a sample counts.
         floor: Least scale of each channel.
         to_bounds: How far each coordinate may move down and up.
-        starts: Slopes of measured first states by the parameters, if the slopes contain them.
     """
     cost, scale = negative_log_likelihood(e, int(np.count_nonzero(seen)), floor)
     with np.errstate(over="ignore", invalid="ignore"):
@@ -450,4 +448,4 @@ def likelihood_equations(
     inner = np.arange(coordinates.size) >= coordinates.shared
     for r in range(len(e)):
         inner[coordinates.local_columns(r)] = False
-    return LikelihoodEquations(cost, scale, g, H, inner, *to_bounds, parts, starts)
+    return LikelihoodEquations(cost, scale, g, H, inner, *to_bounds, parts)
