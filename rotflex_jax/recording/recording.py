@@ -1,5 +1,6 @@
 """A recording: the measured input and outputs of one experiment, its digest, and lists of recordings."""
 
+import copy
 import hashlib
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -612,8 +613,9 @@ def listed_if_given(recordings: Any, name: str, shortest: int = 1) -> tuple[Reco
 
 def with_findings_on_file(recording: Recording, found: Sequence[Finding]) -> Recording:
     """The recording with further findings on the file as a whole, which its parts do not keep."""
-    vars(recording)["findings"] = (*recording.findings, *found)
-    return recording
+    with_them = copy.copy(recording)
+    vars(with_them)["findings"] = (*recording.findings, *found)
+    return with_them
 
 
 def single(recording: Any, name: str = "recording", shortest: int = 1) -> Recording:
