@@ -374,7 +374,7 @@ def test_a_search_tells_what_a_loaded_motor_loses(physics, wanted, rounds):
     """From wrong values of the preset it finds constant friction, gear friction, and saturation."""
     train = recorded((200.0, "sums"), (400.0, "sweep"), **physics)
     validation = recorded((200.0, "sweep"), (400.0, "sums"), **physics)
-    laws = (fx.Coulomb, fx.GearFriction, fx.TorqueSaturation, fx.QuadraticDrag)
+    laws = (fx.Coulomb, fx.GearFriction, fx.TorqueSaturation, fx.Viscous, fx.QuadraticDrag, fx.Heating)
     model = rf.Model(xl330_pendulum(), rf.Exponential(substeps=2))
     found = rf.discover(model, train, validation, candidates=[(law, "hub") for law in laws], rounds=rounds)
     assert sorted(r.effect for r in found.rounds) == wanted
