@@ -14,6 +14,7 @@ import pandas as pd
 import pytest
 import scipy.io
 
+from rotflex_jax import Model, fit, joints
 from rotflex_jax.data import load
 from rotflex_jax.data.excitation import noise
 from rotflex_jax.errors import InputError
@@ -405,6 +406,19 @@ ARRAYS: dict[str, tuple[dict[str, Any], str]] = {
 def test_arrays_that_are_no_recording(kind: str) -> None:
     given, phrase = ARRAYS[kind]
     refused(lambda: Recording(**{"u": U, "y": Y, "Ts": 0.002, **given}), phrase)
+
+
+def test_an_input_of_another_quantity_is_no_input_of_the_model() -> None:
+    """A current for a model that a voltage drives; a unit that is not known, such as %, says nothing."""
+    y = np.column_stack([GOOD["theta"], GOOD["alpha"]])
+    given = {"u": GOOD["voltage"], "y": y, "Ts": 0.002}
+    model = Model(joints.paper())
+    assert model.simulate(Recording(**given, input_unit="%")).shape == (N, 2)
+    assert model.simulate(Recording(**given, input_unit="A", accept="units")).shape == (N, 2)
+    for unit in ("A", "N m"):
+        refused(lambda unit=unit: model.simulate(Recording(**given, input_unit=unit)), f"is in {unit}; give")
+    followed = {**given, "y": model.simulate(Recording(**given, input_unit="%"))}
+    refused(lambda: fit(joints.paper(), Recording(**followed, input_unit="A")), "driven in V, but the input")
 
 
 def test_missing_package_is_named_with_its_extra(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -229,13 +229,17 @@ def told(
     excited: int = 4,
     candidates: int = 4,
     imitated: int = 0,
+    by_noise: float = 0.0,
 ) -> tuple[Verdict, str]:
     """Verdict and sentence of a search with these errors over the noise and equivalents of each round."""
     floor = {"theta": 5e-4, "alpha": 2e-3}
     errors = {"theta": 5e-4, "alpha": 2e-3 * ratio}
     baseline: Any = SimpleNamespace(held_out_rmse_windows={c: before * e for c, e in errors.items()})
     final: Any = SimpleNamespace(
-        held_out_rmse_windows=errors, process_noise_nats=noise_nats, window_seconds=2.0
+        held_out_rmse_windows=errors,
+        process_noise_nats=noise_nats,
+        window_seconds=2.0,
+        expected={"alpha": by_noise * 2e-3} if by_noise else {},
     )
     found: Any = [
         SimpleNamespace(effect="coulomb", port="hub", equivalent=others, phrase=noun + " at the hub")
@@ -254,6 +258,13 @@ def told(
 def ended(**given: Any) -> Verdict:
     """The verdict alone."""
     return told(**given)[0]
+
+
+@pytest.mark.parametrize(("share", "explained"), [(0.999, True), (1.001, False)])
+def test_an_error_that_noise_alone_causes_is_explained(share: float, explained: bool) -> None:
+    verdict, sentence = told(ratio=3.0 * NEAR * share, by_noise=3.0, rounds=((),))
+    assert verdict == (Verdict.FOUND if explained else Verdict.UNEXPLAINED)
+    assert "times the sensor noise (alpha 3.00 by noise in the first samples alone)" in sentence
 
 
 @pytest.mark.parametrize(("share", "explained"), [(0.999, True), (1.001, False)])

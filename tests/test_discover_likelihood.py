@@ -10,12 +10,12 @@ from scipy.optimize import least_squares
 
 import rotflex_jax as rf
 from rotflex_jax.discover import likelihood as refit_module
+from rotflex_jax.discover.integration_step import correct_discretisation_bias
 from rotflex_jax.discover.likelihood import (
     EXTRA_ALTERNATIONS,
     LikelihoodProblem,
     _grid,
     choose_process_noise,
-    correct_discretisation_bias,
     levenberg_marquardt,
     refit,
 )

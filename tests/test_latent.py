@@ -2,11 +2,14 @@
 
 import dataclasses
 import re
+from types import SimpleNamespace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from scipy.integrate import solve_ivp
 from scipy.optimize import minimize
 
@@ -19,8 +22,8 @@ from rotflex_jax.errors import InputError
 from rotflex_jax.fit.dataset import StackedRecordings, sensor_noise
 from rotflex_jax.joints import emps, paper, single_inertia
 from rotflex_jax.latent import latent_torque, smoother
-from rotflex_jax.latent.figure import latent_maps, latent_time
-from rotflex_jax.latent.result import binned_mean, latent_torque_result
+from rotflex_jax.latent.figure import _curve, latent_maps, latent_time
+from rotflex_jax.latent.result import TorqueCurve, binned_mean, latent_torque_result
 from rotflex_jax.latent.smoother import (
     AugmentedStep,
     InitialDistribution,
@@ -36,6 +39,7 @@ from rotflex_jax.models.model import Model
 from rotflex_jax.parameters import Estimate
 from rotflex_jax.recording import Recording
 from rotflex_jax.runtime.xla import double_precision
+from rotflex_jax.text.colours import BASELINE
 
 TRUE = {"hub_damping": 0.004, "joint_damping": 0.003}
 
@@ -374,6 +378,19 @@ def test_a_stay_ends_with_its_recording():
     """The second recording begins in the bin in which the first one ends."""
     x, recording = np.repeat([0.0, 1.0, 1.0, 0.0], 40), np.repeat([0, 0, 1, 1], 40)
     assert binned_mean(x, x, 0 * x, 2, recording)["visits"].tolist() == [2, 2]
+
+
+def test_a_curve_has_no_line_where_there_are_no_samples():
+    """Samples at 0 to 3, 7 to 9 and 13 of 16: one line for each, and none over what lies between."""
+    x = np.repeat([0.0, 1.0, 2.0, 3.0, 7.0, 9.0, 13.0, 15.0, 15.99], 20)
+    found = binned_mean(x, x, 0 * x, 16, np.zeros(len(x), int))
+    assert found["index"].tolist() == [0, 1, 2, 3, 7, 9, 13, 15]
+    curve = TorqueCurve(**found, against="speed", unit="rad/s", port="hub")
+    torque: Any = SimpleNamespace(curve=lambda *given: curve)
+    ax = Figure().subplots()
+    _curve(ax, torque, "hub", "speed", {"color": BASELINE})
+    drawn = ax.lines[0].get_ydata()
+    assert [len(part) for part in np.split(drawn, np.flatnonzero(np.isnan(drawn)))] == [4, 3, 3]
 
 
 def test_a_single_stay_has_a_wide_band():

@@ -54,6 +54,8 @@ def end_state(
     end = assess_stages(baseline, final, floor)
     seconds = final.window_seconds
     reached = f"the held-out error over {seconds:g} s is {in_noise(end.remaining)} times the sensor noise"
+    if end.expected:
+        reached += f" ({in_noise(end.expected)} by noise in the first samples alone)"
     names = " and ".join(effect_phrase(r.effect, r.port) for r in rounds)
     share = f"; {end.explained_text}" if rounds and end.explained_text else ""
     explain, others = "explain", "some of them from others (listed with each)"

@@ -35,13 +35,17 @@ from rotflex_jax.fit.held_constants import with_held_constants
 from rotflex_jax.fit.inference import Combination, curvature, sandwich
 from rotflex_jax.fit.plausibility import check_signs
 from rotflex_jax.mechanism import Solver
+from rotflex_jax.metrics import windowed_rmse
 from rotflex_jax.models.model import Model
 from rotflex_jax.parameters import Estimate
 from rotflex_jax.recording import Recording
+from rotflex_jax.recording.quality import ACCEPTABLE
 from rotflex_jax.runtime.persistent_jit import make_ahead
 
 # Two estimates agree if they differ by no more than this share, however narrow their intervals are.
 SAME_SIZE = 0.25
+# Recordings that are drawn to find the error by noise alone.
+NOISE_DRAWS = 20
 # Largest number of fits of the offsets of a recording; each uses the size of the errors that the last one
 # left.
 MOST_OFFSET_FITS = 8
@@ -102,6 +106,42 @@ def free_runs(validation: ValidationSet, models: Sequence[Model]) -> FreeRuns:
     short = validation.window_rmse(windows)
     by_channel = (dict(zip(channels, errors.tolist(), strict=True)) for errors in (total, short))
     return FreeRuns(whole, windows, RunErrors(*by_channel))
+
+
+def errors_by_noise(validation: ValidationSet, models: Sequence[Model]) -> dict[str, float]:
+    """Errors that short free runs would have by noise alone, if each machine were exactly its model.
+
+    Recordings of such machines are drawn: the runs over windows of the models, with sensor noise. Runs over
+    windows start from their first samples, so this noise moves their first states too. Where motions that
+    start close to each other separate, as in a pendulum near its highest point, it causes most of the error.
+
+    Args:
+        validation: Free runs over the recordings.
+        models: The model of each recording.
+
+    Returns:
+        Channel -> root mean square error [unit of the channel]; empty where a run diverges.
+    """
+    problem, seconds, channels = validation.problem, validation.window_seconds, models[0].mechanism.channels
+    rng, drawn = np.random.default_rng(0), []
+    for model, recording in zip(models, problem.dataset.recordings, strict=True):
+        right = model.simulate_windows(recording, seconds)
+        if not np.all(np.isfinite(right)):
+            return {}
+        for _ in range(NOISE_DRAWS):
+            measured = right + problem.noise * rng.standard_normal(right.shape)
+            like = dataclasses.replace(
+                recording,
+                y=measured,
+                channels=channels,
+                units=tuple(map(recording.unit, channels)),
+                resolution=None,
+                accept=ACCEPTABLE,
+            )
+            drawn.append((like, measured, model.simulate_windows(like, seconds)))
+    recordings, measured, simulated = zip(*drawn, strict=True)
+    rmse = windowed_rmse(recordings, measured, simulated, seconds)
+    return dict(zip(channels, np.nan_to_num(rmse, nan=np.inf).tolist(), strict=True))
 
 
 def errors_with_own_calibration(

@@ -21,7 +21,6 @@ from rotflex_jax.fit.coordinates import FitCoordinates
 from rotflex_jax.fit.dataset import Dataset, StackedRecordings, Windows, torque_scale
 from rotflex_jax.mechanism import Solver, kalman_gains
 from rotflex_jax.mechanism.assembly import Layout
-from rotflex_jax.mechanism.finer_step import with_finer_steps
 from rotflex_jax.optimise.damped_least_squares import NormalEquations, Rules, minimise, step_limits
 from rotflex_jax.recording.recording import of_one_run
 from rotflex_jax.runtime.persistent_jit import make_ahead
@@ -71,6 +70,12 @@ class LikelihoodProblem:
         """The one-step prediction of a dataset by a super-model."""
         predictor = BatchedPredictor(supermodel, solver, dataset.data, dataset.constants)
         return cls(predictor, dataset, ports, Windows.whole(dataset), trained=trained)
+
+    def with_solver(self, solver: Solver) -> "LikelihoodProblem":
+        """The same likelihood with another integration rule."""
+        predictor = self.predictor
+        other = BatchedPredictor(predictor.supermodel, solver, predictor.data, predictor.constants)
+        return dataclasses.replace(self, predictor=other)
 
     def of_free_runs(self, windows: Windows) -> "LikelihoodProblem":
         """The likelihood of free runs over windows, with the same compiled programs."""
@@ -493,55 +498,3 @@ def _refitted(problem: LikelihoodProblem, h: Hypothesis, wide: bool, alternation
         if gain < (1.0 if k + 1 < alternations else EXTRA_ALTERNATION_NATS):
             break
     return current.hypothesis
-
-
-# Where friction sticks and slips at other samples, the slopes predict too large a decrease. Most steps need
-# no more damping than this; otherwise a few steps are refused until the damping is large enough.
-CORRECTION_RULES = Rules(enough=MIN_DECREASE_NATS, damping=1e-6, increase=30)
-MAX_CORRECTION_STEPS = 10
-
-
-def finer_integration(problem: LikelihoodProblem, h: Hypothesis) -> LikelihoodProblem | None:
-    """The likelihood with shorter integration steps; None where `with_finer_steps` has no shorter ones."""
-    predictor, s = problem.predictor, problem.supermodel
-    solver = with_finer_steps(predictor.solver, s.clean(h.mean_values(s), h.locations).effects)
-    if solver is None:
-        return None
-    finer = BatchedPredictor(s, solver, predictor.data, predictor.constants)
-    return dataclasses.replace(problem, predictor=finer)
-
-
-def correct_discretisation_bias(problem: LikelihoodProblem, h: Hypothesis) -> Hypothesis:
-    """The hypothesis after a few damped Gauss-Newton steps on the innovations of a finer integration.
-
-        x <- x - (J'J)^-1 J'w
-
-    with the slopes `J` of the integration step of the search and the whitened innovations `w` of
-    `finer_integration`. Friction that builds up within a sample may shift an estimate by several of its
-    standard deviations. Where the motion is linear, the step is exact and no parameter moves.
-
-    Args:
-        problem: Likelihood of the training recordings.
-        h: The hypothesis at its optimum.
-    """
-    seen, fine = problem.seen, finer_integration(problem, h)
-    if fine is None:
-        return h
-    coordinates = FitCoordinates.of(h, problem.windows)
-    _, J = problem.slopes([h])
-    W = h.whitener(J[0, : h.moved], seen)
-
-    def linearise(x: Hypothesis) -> NormalEquations:
-        w = h.whitener(fine.innovations([x])[0], seen)
-        H, g = coordinates.sums(w, W)
-        return NormalEquations(np.array([0.5 * np.sum(w**2)]), g, H)
-
-    found = minimise(
-        linearise,
-        h,
-        CORRECTION_RULES,
-        limit=coordinates.step_limit(problem.step_limits(h)),
-        move=coordinates.moved,
-        max_steps=MAX_CORRECTION_STEPS,
-    )
-    return h if found.x is h else problem.with_likelihood(found.x)

@@ -129,6 +129,8 @@ class Stage:
         friction_of_runs: Sizes of friction that differ between runs: name -> value in each training
             recording.
         friction_of_validation: The same in each validation recording: that of its run, or fitted to it.
+        expected: Channel -> error of short free runs by noise alone (`evaluation.errors_by_noise`); empty
+            where the verdict does not depend on it.
     """
 
     model: Model
@@ -149,6 +151,7 @@ class Stage:
     of_validation: tuple[Model, ...] = ()
     friction_of_runs: dict[str, tuple[float, ...]] = dataclasses.field(default_factory=dict)
     friction_of_validation: dict[str, tuple[float, ...]] = dataclasses.field(default_factory=dict)
+    expected: dict[str, float] = dataclasses.field(default_factory=dict)
 
     def model_on(self, i: int) -> Model:
         """The model for validation recording `i`."""
@@ -237,7 +240,7 @@ def assess_stages(baseline: Stage, final: Stage, floor: dict[str, float]) -> Ass
         floor: Standard deviation of the sensor noise per channel.
     """
     errors = baseline.held_out_rmse_windows, final.held_out_rmse_windows
-    return assess(*errors, floor, final.process_noise_nats, final.window_seconds)
+    return assess(*errors, floor, final.process_noise_nats, final.window_seconds, final.expected)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -22,12 +22,13 @@ from rotflex_jax.discover.forward_selection import (
     score_candidates,
 )
 from rotflex_jax.discover.in_place import take_better_laws, undecided_rivals
-from rotflex_jax.discover.likelihood import (
-    LikelihoodProblem,
+from rotflex_jax.discover.integration_step import (
     correct_discretisation_bias,
     finer_integration,
+    shorten_steps,
 )
-from rotflex_jax.discover.pairs import pairs_passed_by
+from rotflex_jax.discover.likelihood import LikelihoodProblem, refit
+from rotflex_jax.discover.pairs import is_unexplained, pairs_passed_by
 from rotflex_jax.discover.result import KnownRuns, longest_recording
 from rotflex_jax.discover.search_state import SearchState, as_it_was, fit_as_it_is
 from rotflex_jax.discover.selection import is_poor
@@ -40,7 +41,13 @@ from rotflex_jax.discover.stepwise import (
 )
 from rotflex_jax.discover.summary import conclude, evaluate_models
 from rotflex_jax.discover.supermodel import SuperModel, build, checked_candidates, scales
-from rotflex_jax.discover.validation import Horizons, ValidatedHypothesis, validate
+from rotflex_jax.discover.validation import (
+    Horizons,
+    ValidatedHypothesis,
+    as_free_run,
+    as_prediction,
+    validate,
+)
 from rotflex_jax.effects.base import Effect
 from rotflex_jax.effects.labels import effect_phrase
 from rotflex_jax.errors import InputError
@@ -59,6 +66,9 @@ from rotflex_jax.recording.recording import (
 )
 from rotflex_jax.runtime.persistent_jit import clear_compilation_caches, loaded_ahead
 from rotflex_jax.runtime.xla import on_threads, one_thread
+
+# A second fit of the same model replaces the first one if it is likelier by more than this [nat].
+BETTER_FIT_NATS = 1.0
 
 
 @one_thread
@@ -142,14 +152,12 @@ def discover(
         else:
             state = as_it_was(model, horizons, say, digest, resume)
         state.reading_notes += (*left_out, *_not_tried(candidates or (), supermodel))
-        while len(state.scores) < rounds:
-            # 3. Score all candidates.
-            promising = score_candidates(state)
-            # 4. Refit the best candidates and decide; if none passes alone, try two together.
-            if add_best(state, promising) or add_dry_friction(state, promising):
-                continue
-            if not add_pair(state, rounds):
-                break
+        # 3. and 4. Add effects; if the steps of integration cause most of the error that is left, with
+        # shorter steps.
+        _add_effects(state, rounds)
+        while shorten_steps(state):
+            evaluation = Evaluation.of(state.model, state.horizons, tested, calibrate_seconds)
+            _add_effects(state, rounds)
         # 5. Leave out what is not needed, and check whether single steps have missed a pair.
         _make_ahead(state, evaluation)
         _simplify(state)
@@ -158,6 +166,19 @@ def discover(
         evaluated = evaluate_models(state, evaluation)
         # 7. Conclude with the verdict, and with the next experiment if the verdict is ambiguous.
         return with_proposal(conclude(state, evaluated, started))
+
+
+def _add_effects(state: SearchState, rounds: int) -> None:
+    """Add effects until none passes, or until there are as many as `rounds`."""
+    while len(state.scores) < rounds:
+        # 3. Score all candidates.
+        promising = score_candidates(state)
+        # 4. Refit the best candidates and decide; if none passes alone, try two together.
+        if add_best(state, promising) or add_dry_friction(state, promising):
+            continue
+        if not add_pair(state, rounds):
+            break
+    _refit_from_other_horizon(state)
 
 
 def _with_signals(
@@ -303,6 +324,32 @@ def _simplify(state: SearchState) -> None:
         rivals[one.effect] = [*before, *(one.replaced if one.same_count else ())]
     state.order, state.own, state.notes, state.rivals = order, assigned.own, notes, rivals
     state.final = correct_discretisation_bias(problem, final)
+
+
+def _refit_from_other_horizon(state: SearchState) -> None:
+    """Fit the present model at each horizon from its fit at the other one too, and keep the likelier fits.
+
+    A process noise that was likely beside parameters that were not yet right may stay likely beside the
+    parameters that are fitted with it, and a fit to free runs may end in a local minimum. Where motions that
+    start close to each other separate, as in a pendulum, either would say that something is missing.
+    """
+    horizons, h, runs = state.horizons, state.current.hypothesis, state.current.free_run
+    assert runs
+    r = runs.hypothesis
+    if not is_unexplained(horizons, state.current) or r.local != h.local:
+        return
+    prediction, free_run = horizons.prediction.problem, horizons.free_run.problem
+    least = [as_prediction(prediction, parameters, h) for parameters in (r, h)]
+    found = max([h, *refit(prediction, least)], key=lambda fit: fit.log_likelihood)
+    (other,) = refit(free_run, [as_free_run(free_run, found)])
+    better = [
+        new.log_likelihood > old.log_likelihood + BETTER_FIT_NATS for new, old in ((found, h), (other, r))
+    ]
+    if any(better):
+        fits = found if better[0] else h, other if better[1] else r
+        state.current = horizons.validated(*fits, state.current)
+        state.passed[-1] = state.current
+        state.tried.insert(0, state.current)
 
 
 def _eliminate(state: SearchState) -> Eliminated:

@@ -86,6 +86,7 @@ class SearchState:
         nominal: The user's model with its given values; None unless the fit has moved far away from them.
         resumed: Number of rounds of a stopped search after which this search continued.
         reading_notes: Notes that recordings may have been read wrongly, or cannot decide.
+        step_note: A note that steps of integration are shorter than asked for; empty if they are not.
         digest: Digest of everything that the models depend on.
     """
 
@@ -96,6 +97,7 @@ class SearchState:
     digest: str = ""
     resumed: int = 0
     reading_notes: tuple[str, ...] = ()
+    step_note: tuple[str, ...] = ()
     ranking: list[tuple[Score, float]] = dataclasses.field(default_factory=list)
     scores: dict[EffectLocation, float] = dataclasses.field(default_factory=dict)
     rivals: dict[EffectLocation, list[EffectLocation]] = dataclasses.field(default_factory=dict)

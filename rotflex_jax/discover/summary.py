@@ -13,6 +13,7 @@ from rotflex_jax.discover.evaluation import (
     PairedEstimates,
     difference_notes,
     disagreement,
+    errors_by_noise,
     estimates,
     evaluate,
     own_estimates,
@@ -21,11 +22,8 @@ from rotflex_jax.discover.evaluation import (
 from rotflex_jax.discover.final_fit import Refused, fit_to_all
 from rotflex_jax.discover.friction_of_runs import own_friction_notes
 from rotflex_jax.discover.hypothesis import Hypothesis
-from rotflex_jax.discover.likelihood import (
-    choose_process_noise,
-    finer_integration,
-    process_noise_gain,
-)
+from rotflex_jax.discover.integration_step import finer_integration
+from rotflex_jax.discover.likelihood import choose_process_noise, process_noise_gain
 from rotflex_jax.discover.localise import locate_in_windows
 from rotflex_jax.discover.probabilities import Probabilities, fitted_sets, probabilities
 from rotflex_jax.discover.result import (
@@ -52,7 +50,7 @@ from rotflex_jax.discover.stepwise import (
     titled,
 )
 from rotflex_jax.discover.supermodel import EffectLocation
-from rotflex_jax.discover.validation import ValidatedHypothesis, validate
+from rotflex_jax.discover.validation import ValidatedHypothesis, ValidationSet, validate
 from rotflex_jax.effects import CATALOG, ChannelDelay, SensorBias
 from rotflex_jax.effects.labels import effect_phrase
 from rotflex_jax.fit.plausibility import BEYOND_RECORDINGS, Remark, at_bounds, beyond_recordings
@@ -107,6 +105,7 @@ def evaluate_models(state: SearchState, evaluation: Evaluation) -> EvaluatedMode
         return evaluation.of_stage(found, validated[k], order[:k])
 
     stages = on_threads(stage, range(len(models)))
+    stages[-1] = _with_expected_errors(state, stages, built, validated[-1])
     train, held_back = problem.dataset.recordings, validation.problem.dataset.recordings
     longest = longest_recording(train, held_back)
     seconds, noise = validation.window_seconds, problem.noise
@@ -161,6 +160,7 @@ def conclude(state: SearchState, evaluated: EvaluatedModels, started: float) -> 
         elapsed_s=time.perf_counter() - started,
         notes=(
             *state.reading_notes,
+            *state.step_note,
             *_resumed(state.resumed),
             *conditional_note(conditional),
             *calibration_notes(supermodel, evaluated.final, state.own, used.mechanism),
@@ -275,6 +275,27 @@ def _with_process_noise(state: SearchState, stage: Stage, h: Hypothesis, correct
     finer = finer_integration(problem, h) if corrected else None
     gain = process_noise_gain(finer or problem, h)
     return dataclasses.replace(stage, process_noise=h.process_noise, process_noise_nats=gain)
+
+
+def _with_expected_errors(
+    state: SearchState, stages: Sequence[Stage], validation: ValidationSet, final: ValidatedHypothesis
+) -> Stage:
+    """The last stage; with the errors that noise alone causes, if the verdict depends on these.
+
+    Args:
+        state: The search with what it has found.
+        stages: The evaluated models.
+        validation: The validation recordings.
+        final: The last model.
+    """
+    stage = stages[-1]
+    end = assess_stages(stages[0], stage, state.noise_floor)
+    if end.at_noise or not end.torque_free:
+        return stage
+    trained = final.with_trained_calibrations(state.problem.supermodel)
+    every = range(len(validation.problem.dataset.recordings))
+    models = [validation.model_of(trained, state.order, i) for i in every]
+    return dataclasses.replace(stage, expected=errors_by_noise(validation, models))
 
 
 def _rounds(

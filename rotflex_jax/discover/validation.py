@@ -19,6 +19,7 @@ from rotflex_jax.discover.likelihood import DIVERGED, LikelihoodProblem, in_bloc
 from rotflex_jax.discover.supermodel import EffectLocation, SuperModel
 from rotflex_jax.fit.coordinates import FitCoordinates
 from rotflex_jax.fit.dataset import Dataset, Windows
+from rotflex_jax.mechanism import Solver
 from rotflex_jax.metrics import counted, window_starts, windowed_rmse
 from rotflex_jax.models.model import Model
 from rotflex_jax.optimise.damped_least_squares import NormalEquations, Rules, minimise_together
@@ -224,6 +225,13 @@ class ValidationSet:
             for k in every
         )
         return cls(problem, window_seconds, folds=folds)
+
+    def with_solver(self, solver: Solver) -> "ValidationSet":
+        """The same recordings with another integration rule."""
+        problem = self.problem.with_solver(solver)
+        if self.folds:
+            return self.leave_one_out(problem, self.window_seconds)
+        return dataclasses.replace(self, problem=problem)
 
     @property
     def counted(self) -> tuple[int, ...]:
@@ -480,6 +488,10 @@ class SearchHorizon:
     problem: LikelihoodProblem
     validation: ValidationSet
 
+    def with_solver(self, solver: Solver) -> "SearchHorizon":
+        """The same recordings with another integration rule."""
+        return SearchHorizon(self.problem.with_solver(solver), self.validation.with_solver(solver))
+
 
 @dataclasses.dataclass(frozen=True)
 class Horizons:
@@ -519,6 +531,10 @@ class Horizons:
             sets = [ValidationSet(p[1], seconds) for p in (whole, cut)]
         return cls(SearchHorizon(whole[0], sets[0]), SearchHorizon(cut[0], sets[1]))
 
+    def with_solver(self, solver: Solver) -> "Horizons":
+        """Both horizons with another integration rule."""
+        return Horizons(self.prediction.with_solver(solver), self.free_run.with_solver(solver))
+
     def validated(
         self, prediction: Hypothesis, free_run: Hypothesis, near: ValidatedHypothesis | None = None
     ) -> ValidatedHypothesis:
@@ -551,3 +567,16 @@ def as_free_run(problem: LikelihoodProblem, h: Hypothesis) -> Hypothesis:
     no_noise = dict.fromkeys(problem.ports, 0.0)
     start = problem.with_process_noise(dataclasses.replace(h, x0=x0), no_noise)
     return problem.with_likelihood(start)
+
+
+def as_prediction(problem: LikelihoodProblem, h: Hypothesis, like: Hypothesis) -> Hypothesis:
+    """A hypothesis of predictions with the least process noise and the parameters of another one.
+
+    Args:
+        problem: Likelihood of predictions of the same recordings.
+        h: Gives the parameters, such as those fitted to free runs; nothing is fitted again.
+        like: The same structure fitted to predictions, which gives the first states.
+    """
+    least = dict.fromkeys(problem.ports, problem.process_noise_range[0])
+    start = dataclasses.replace(like, z=h.z, local_z=h.local_z)
+    return problem.with_likelihood(problem.with_process_noise(start, least))

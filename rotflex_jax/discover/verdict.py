@@ -17,8 +17,8 @@ NEAR_FLOOR = 1.5
 # An error from this multiple of the sensor noise on counts as far from the noise.
 FAR_FLOOR = 5.0
 # The model explains the recordings if process noise gains less than this per measured value of the training
-# recordings [nat], and errors of short free runs over validation recordings are below `NEAR_FLOOR` times the
-# noise.
+# recordings [nat], and errors of short free runs over validation recordings are below `NEAR_FLOOR` times what
+# noise alone causes.
 TORQUE_NATS = 0.03
 
 
@@ -55,17 +55,25 @@ class Assessment:
         torque_nats: Log-likelihood that random torques still gain per measured value of the training
             recordings [nat]; near 0 if the model is right.
         seconds: Length of the free runs of `remaining` [s]; 0 if it is not known.
+        expected: Channel -> error of such runs by noise alone, in multiples of the sensor noise: noise in the
+            first samples of a run also moves its first state. Channels without a value count as 1.
     """
 
     explained: dict[str, float]
     remaining: dict[str, float]
     torque_nats: float
     seconds: float = 0.0
+    expected: dict[str, float] = dataclasses.field(default_factory=dict)
+
+    @property
+    def _over_expected(self) -> dict[str, float]:
+        """Channel -> error that remains, in multiples of what noise alone causes."""
+        return {c: times / max(1.0, self.expected.get(c, 1.0)) for c, times in self.remaining.items()}
 
     @property
     def at_noise(self) -> bool:
-        """Whether the errors of all channels have reached the noise."""
-        return all(times < NEAR_FLOOR for times in self.remaining.values())
+        """Whether the errors of all channels have reached what noise causes."""
+        return all(times < NEAR_FLOOR for times in self._over_expected.values())
 
     @property
     def torque_free(self) -> bool:
@@ -84,7 +92,7 @@ class Assessment:
         It is the largest of these ratios: square of the error of short free runs in a channel over its limit,
         and gain of random torques over its limit. The limits are those of the verdict.
         """
-        shares = [(times / NEAR_FLOOR) ** 2 for times in self.remaining.values()]
+        shares = [(times / NEAR_FLOOR) ** 2 for times in self._over_expected.values()]
         shares.append(self.torque_nats / TORQUE_NATS)
         return math.inf if any(map(math.isnan, shares)) else max(1.0, *shares)
 
@@ -105,14 +113,23 @@ class Assessment:
                     f"the sensor noise of {' and '.join(unknown)} is not known, to compare what is left with"
                 )
             times = in_noise(self.remaining)
-            return f"errors of {runs} are {times} times the sensor noise (limit {NEAR_FLOOR:g})"
-        within = f"errors of {runs} are within {NEAR_FLOOR:g} times the sensor noise"
+            limits = {c: NEAR_FLOOR * max(1.0, times) for c, times in self.expected.items()}
+            limit = in_noise(limits) if limits else f"{NEAR_FLOOR:g}"
+            return f"errors of {runs} are {times} times the sensor noise (limit {limit})"
+        within = f"errors of {runs} are within {NEAR_FLOOR:g} times {self._noise_alone}"
         if not self.torque_free:
             return (
                 f"{within}, but predictions are likelier with a random torque ({self.torque_nats:.2g} nat "
                 f"per measured value, limit {TORQUE_NATS:g})"
             )
         return f"{within}, and predictions are hardly likelier with a random torque"
+
+    @property
+    def _noise_alone(self) -> str:
+        """What the limit of the errors is relative to, in words."""
+        if not self.expected:
+            return "the sensor noise"
+        return f"what noise alone causes ({in_noise(self.expected)} times the sensor noise)"
 
     @property
     def explained_text(self) -> str:
@@ -125,6 +142,7 @@ class Assessment:
         return {
             "explained_percent": json_numbers(self.explained),
             "remaining_over_noise": json_numbers(self.remaining),
+            "expected_over_noise": json_numbers(self.expected),
             "random_torque_nats_per_value": json_number(self.torque_nats),
             "grade": self.grade,
             "criterion": self.criterion,
@@ -137,6 +155,7 @@ def assess(
     floor: Mapping[str, float],
     nats: float,
     seconds: float = 0.0,
+    expected: Mapping[str, float] | None = None,
 ) -> Assessment:
     """The assessment of a final model by its errors.
 
@@ -146,6 +165,7 @@ def assess(
         floor: Channel -> standard deviation of the sensor noise.
         nats: Log-likelihood per measured value that random torques gain over the final model [nat].
         seconds: Length of these runs [s]; 0 if it is not known.
+        expected: Channel -> error of these runs by noise alone; the sensor noise if it is not known.
 
     >>> end = assess({"theta": 0.1}, {"theta": 0.002}, {"theta": 0.001}, 0.005)
     >>> round(end.explained["theta"], 2), end.remaining, end.is_explained, end.grade
@@ -154,7 +174,8 @@ def assess(
     # There is no share where runs of the baseline diverge or have no error.
     shares = {c: 100 * (1 - (after[c] / e) ** 2) if 0 < e < math.inf else math.nan for c, e in before.items()}
     remaining = {c: ratio(after[c], floor.get(c)) for c in after}
-    return Assessment(shares, remaining, nats, seconds)
+    by_noise = {c: ratio(e, floor.get(c)) for c, e in (expected or {}).items()}
+    return Assessment(shares, remaining, nats, seconds, by_noise)
 
 
 def in_noise(remaining: Mapping[str, float]) -> str:

@@ -236,6 +236,6 @@ def noise_std(
         raise InputError(
             f"The sensor noise was given as {noise if good else checks.shown(noise)}, but every channel "
             f"({', '.join(channels)}) needs a positive standard deviation; give "
-            "noise={'theta': 5e-4, 'alpha': 5e-4}, or a Fit, which has it."
+            f"noise={dict.fromkeys(channels, 5e-4)}, or a Fit, which has it."
         )
     return np.array(sd)

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -111,10 +112,18 @@ def _curve(ax: Axes, torque: LatentTorque, port: str, against: Abscissa, style: 
     """Draw a binned mean with its band and, for the baseline, with the spread of single samples."""
     c = torque.curve(port, against)
     scale, read = readable(1.0, c.unit)
-    at = scale * c.at
+    # No line where bins were left out: nothing is known of the torque there. A single one is passed over.
+    gaps = np.flatnonzero(np.diff(c.index) > 2) + 1
+    at, mean, low, high, spread = (
+        np.insert(x, gaps, np.nan) for x in (scale * c.at, c.mean, c.low, c.high, c.spread)
+    )
     if style["color"] == BASELINE:
-        ax.fill_between(at, c.mean - c.spread, c.mean + c.spread, color=FAINT, lw=0, label="± spread")
-    ax.fill_between(at, c.low, c.high, color=style["color"], alpha=0.3, lw=0)
-    ax.plot(at, c.mean, lw=1.5, **style)
+        ax.fill_between(at, mean - spread, mean + spread, color=FAINT, lw=0, label="± spread")
+    ax.fill_between(at, low, high, color=style["color"], alpha=0.3, lw=0)
+    ax.plot(at, mean, lw=1.5, **style)
+    edges = np.isnan(np.r_[np.nan, mean, np.nan])
+    alone = edges[:-2] & ~edges[1:-1] & edges[2:]
+    ax.vlines(at[alone], low[alone], high[alone], color=style["color"], alpha=0.3, lw=3)
+    ax.plot(at[alone], mean[alone], ".", ms=4, color=style["color"])
     ax.set_xlabel(f"{c.against} [{read}]")
     ax.margins(x=0.02)

@@ -47,6 +47,7 @@ class TorqueCurve:
         spread: Standard deviation of single samples about the mean [N m].
         count: Number of samples in each bin.
         visits: Number of separate stays in each bin.
+        index: Number of each bin; those of bins that are left out are missing.
         against: Name of the abscissa.
         unit: Unit of the abscissa.
         port: Port at which the torque acts.
@@ -59,6 +60,7 @@ class TorqueCurve:
     spread: Float[np.ndarray, " B"]
     count: Int[np.ndarray, " B"]
     visits: Int[np.ndarray, " B"]
+    index: Int[np.ndarray, " B"]
     against: str
     unit: str
     port: str
@@ -110,6 +112,7 @@ def binned_mean(
         "spread": np.sqrt(scatter[kept]),
         "count": count[kept].astype(int),
         "visits": visits[kept],
+        "index": np.flatnonzero(kept),
     }
 
 

@@ -42,6 +42,9 @@ def _motor_voltage(structure: Mechanism, values: Array, gates: Array, u: Array, 
 
 
 MOST_DOUBLED = 16384
+# Units of inputs that contradict a model with another one. "V" is not among them, since a recording made in
+# Python has it unless it says otherwise.
+OTHER_INPUTS = ("A", "mA", "N", "N m", "rad", "m")
 
 
 def program_length(number: int, least: int = 1024) -> int:
@@ -204,9 +207,16 @@ class Model:
         """The input of a recording (N,); with the signals of the mechanism, if it has any, (N, 1 + S).
 
         Raises:
-            InputError: The recording lacks one of these signals.
+            InputError: The recording lacks one of these signals, or says that its input is another quantity.
         """
         recording, names = single(recording), self.mechanism.signals
+        driven, given = self.mechanism.units.input, recording.input_unit
+        if given in OTHER_INPUTS and given != driven and "units" not in recording.accept:
+            raise InputError(
+                f"The model is driven in {driven}, but the input {recording.input_name!r} of the recording "
+                f"is in {given}; give a model with such an input (for a current one with CurrentDrive and "
+                "Units(input='A')), the right input_unit, or accept=('units',)."
+            )
         if missing := [name for name in names if name not in recording.signals]:
             has = ", ".join(map(repr, recording.signals)) or "none"
             raise InputError(

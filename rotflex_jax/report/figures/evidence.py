@@ -120,9 +120,12 @@ def ranking(discovery: SearchResult) -> Figure | None:
 
 
 def _staircase_caption(discovery: SearchResult) -> str:
-    reached = [c for c, r in noise_ratios(discovery).items() if r < NEAR_FLOOR]
+    by_noise = discovery.assessment.expected
+    reached = [
+        c for c, r in noise_ratios(discovery).items() if r < NEAR_FLOOR * max(1.0, by_noise.get(c, 1.0))
+    ]
     end = (
-        f"The error of {' and '.join(reached)} ends at the noise of the sensor."
+        f"The error of {' and '.join(reached)} ends at what the noise of the sensor causes."
         if reached
         else "What is left above the dashed line is not the sensor's noise."
     )
