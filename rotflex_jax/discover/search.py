@@ -152,8 +152,7 @@ def discover(
         else:
             state = as_it_was(model, horizons, say, digest, resume)
         state.reading_notes += (*left_out, *_not_tried(candidates or (), supermodel))
-        # 3. and 4. Add effects; if the steps of integration cause most of the error that is left, with
-        # shorter steps.
+        # 3. and 4. Add effects; go on in shorter steps of integration if the present ones cause the error.
         _add_effects(state, rounds)
         while shorten_steps(state):
             evaluation = Evaluation.of(state.model, state.horizons, tested, calibrate_seconds)
