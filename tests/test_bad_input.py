@@ -418,7 +418,10 @@ def test_an_input_of_another_quantity_is_no_input_of_the_model() -> None:
     for unit in ("A", "N m"):
         refused(lambda unit=unit: model.simulate(Recording(**given, input_unit=unit)), f"is in {unit}; give")
     followed = {**given, "y": model.simulate(Recording(**given, input_unit="%"))}
-    refused(lambda: fit(joints.paper(), Recording(**followed, input_unit="A")), "driven in V, but the input")
+    refused(
+        lambda: fit(joints.paper(), Recording(**followed, input_unit="A")),
+        "motor of the model is driven in V",
+    )
 
 
 def test_missing_package_is_named_with_its_extra(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -188,7 +188,7 @@ def spun_base(N: int = 100, seed: int = 15) -> Recording:
     """A joint with dry friction on a moving base, with noise: scipy's run at 250 Hz."""
     u, a = coloured(N, 3.0, seed, 40), coloured(N, 25.0, seed + 1, 40)
     y = moving_base(u, a, friction=0.02) + np.random.default_rng(seed + 2).normal(scale=2e-4, size=(N, 2))
-    return Recording(u=u, y=y, Ts=TS, input_name="current", input_unit="A", signals={BASE: a})
+    return Recording(u=u, y=y, Ts=TS, signals={BASE: a})
 
 
 @pytest.fixture(scope="module")
@@ -310,7 +310,7 @@ def test_a_fit_does_not_take_a_signal_for_a_wrong_sign():
     w = np.column_stack([u, 50 * u])
     model = joint(*on_moving_base())
     y = simulate(model, w, TS) + np.random.default_rng(0).normal(scale=1e-5, size=(1500, 2))
-    recording = Recording(u=u, y=y, Ts=TS, input_name="current", input_unit="A", signals={BASE: w[:, 1]})
+    recording = Recording(u=u, y=y, Ts=TS, signals={BASE: w[:, 1]})
     assert rf.fit(model, recording).status == "converged"
 
 

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float, Int, Real
 
 from rotflex_jax.checks import number, shown, vector
 from rotflex_jax.effects.base import Actuation, DryFriction, Effect, Gear
+from rotflex_jax.effects.motor import Motor
 from rotflex_jax.errors import InputError
 from rotflex_jax.mechanism import Exponential, Mechanism, Solver, free_run, kalman_gains, predictor_run
 from rotflex_jax.mechanism.assembly import effects_of, motor_voltage, rest_state
@@ -42,8 +43,7 @@ def _motor_voltage(structure: Mechanism, values: Array, gates: Array, u: Array, 
 
 
 MOST_DOUBLED = 16384
-# Units of inputs that contradict a model with another one. "V" is not among them, since a recording made in
-# Python has it unless it says otherwise.
+# Units of inputs that are no voltage. Other words, such as %, may stand for one.
 OTHER_INPUTS = ("A", "mA", "N", "N m", "rad", "m")
 
 
@@ -210,12 +210,12 @@ class Model:
             InputError: The recording lacks one of these signals, or says that its input is another quantity.
         """
         recording, names = single(recording), self.mechanism.signals
-        driven, given = self.mechanism.units.input, recording.input_unit
-        if given in OTHER_INPUTS and given != driven and "units" not in recording.accept:
+        given = recording.input_unit
+        if given in OTHER_INPUTS and effects_of(self.mechanism, Motor) and "units" not in recording.accept:
             raise InputError(
-                f"The model is driven in {driven}, but the input {recording.input_name!r} of the recording "
-                f"is in {given}; give a model with such an input (for a current one with CurrentDrive and "
-                "Units(input='A')), the right input_unit, or accept=('units',)."
+                f"The motor of the model is driven in V, but the input {recording.input_name!r} of the "
+                f"recording is in {given}; give a model with such an input (for a current one with "
+                "CurrentDrive and Units(input='A')), the right input_unit, or accept=('units',)."
             )
         if missing := [name for name in names if name not in recording.signals]:
             has = ", ".join(map(repr, recording.signals)) or "none"
