@@ -211,7 +211,8 @@ class Model:
         """
         recording, names = single(recording), self.mechanism.signals
         given = recording.input_unit
-        if given in OTHER_INPUTS and effects_of(self.mechanism, Motor) and "units" not in recording.accept:
+        other = given in OTHER_INPUTS and given != self.mechanism.units.input
+        if other and effects_of(self.mechanism, Motor) and "units" not in recording.accept:
             raise InputError(
                 f"The motor of the model is driven in V, but the input {recording.input_name!r} of the "
                 f"recording is in {given}; give a model with such an input (for a current one with "
