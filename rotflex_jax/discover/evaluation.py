@@ -253,7 +253,7 @@ def evaluate(
     h, s = validated.hypothesis, problem.supermodel
     trained = validated.with_trained_calibrations(s)
     every = range(len(validation.problem.dataset.recordings))
-    runs = free_runs(validation, [validation.model_of(trained, locations, i) for i in every])
+    runs = free_runs(validation, validation.models_as_trained(validated, locations))
     differ = s.phased.intersection(h.local).union(h.sizes)
     values, adapted, names = h.values(s), trained.values(s), s.mechanism.parameter_names
     of_each = [s.clean(adapted[i], locations) for i in every] if differ else []

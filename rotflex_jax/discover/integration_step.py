@@ -113,12 +113,11 @@ def _integrate_in(state: SearchState, solver: Exponential) -> None:
     state.model = dataclasses.replace(state.model, solver=own)
     state.horizons = horizons = state.horizons.with_solver(solver)
     predictions, runs = state.fits
-    starts = correct_discretisation_bias(state.problem, predictions), runs
-    (first,), (second,) = (
-        refit(at.problem, [at.problem.with_likelihood(h)], wide=True)
-        for at, h in zip((horizons.prediction, horizons.free_run), starts, strict=True)
-    )
-    state.current = horizons.validated(first, second, state.current)
-    state.passed[-1], state.tried = state.current, [state.current]
+    prediction, free_run = horizons.prediction.problem, horizons.free_run.problem
+    start = prediction.with_likelihood(correct_discretisation_bias(prediction, predictions))
+    (first,) = refit(prediction, [start], wide=True)
+    (second,) = refit(free_run, [free_run.with_likelihood(runs)])
+    state.tried = []
+    state.take_refit(horizons.validated(first, second, state.current))
     if state.nominal and not state.scores:
         state.nominal = as_given(horizons)

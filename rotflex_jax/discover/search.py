@@ -153,12 +153,11 @@ def discover(
             state = as_it_was(model, horizons, say, digest, resume)
         state.reading_notes += (*left_out, *_not_tried(candidates or (), supermodel))
         # 3. and 4. Add effects; go on in shorter steps of integration if the present ones cause the error.
-        _add_effects(state, rounds)
+        _add_effects(state, rounds, evaluation)
         while shorten_steps(state):
             evaluation = Evaluation.of(state.model, state.horizons, tested, calibrate_seconds)
-            _add_effects(state, rounds)
+            _add_effects(state, rounds, evaluation)
         # 5. Leave out what is not needed, and check whether single steps have missed a pair.
-        _make_ahead(state, evaluation)
         _simplify(state)
         _check_pairs(state)
         # 6. Evaluate every nested model, and localise the errors of the baseline.
@@ -167,7 +166,7 @@ def discover(
         return with_proposal(conclude(state, evaluated, started))
 
 
-def _add_effects(state: SearchState, rounds: int) -> None:
+def _add_effects(state: SearchState, rounds: int, evaluation: Evaluation) -> None:
     """Add effects until none passes, or until there are as many as `rounds`."""
     while len(state.scores) < rounds:
         # 3. Score all candidates.
@@ -177,6 +176,7 @@ def _add_effects(state: SearchState, rounds: int) -> None:
             continue
         if not add_pair(state, rounds):
             break
+    _make_ahead(state, evaluation)  # what shorter steps and the end of a search need, beside the refits
     _refit_from_other_horizon(state)
 
 
@@ -346,9 +346,7 @@ def _refit_from_other_horizon(state: SearchState) -> None:
     ]
     if any(better):
         fits = found if better[0] else h, other if better[1] else r
-        state.current = horizons.validated(*fits, state.current)
-        state.passed[-1] = state.current
-        state.tried.insert(0, state.current)
+        state.take_refit(horizons.validated(*fits, state.current))
 
 
 def _eliminate(state: SearchState) -> Eliminated:

@@ -267,6 +267,11 @@ class SearchState:
         self.passed.append(self.current)
         self.reached("+ " + " + ".join(str(effect.location) for effect in added), added)
 
+    def take_refit(self, found: ValidatedHypothesis) -> None:
+        """Take another fit of the current model in its place."""
+        self.current = self.passed[-1] = found
+        self.tried.insert(0, found)
+
     def in_order(self, on: Collection[EffectLocation]) -> list[EffectLocation]:
         """The effects, among those that are on, that the search has added, in order.
 

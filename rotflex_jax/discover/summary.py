@@ -292,9 +292,7 @@ def _with_expected_errors(
     end = assess_stages(stages[0], stage, state.noise_floor)
     if end.at_noise or not end.torque_free:
         return stage
-    trained = final.with_trained_calibrations(state.problem.supermodel)
-    every = range(len(validation.problem.dataset.recordings))
-    models = [validation.model_of(trained, state.order, i) for i in every]
+    models = validation.models_as_trained(final, state.order)
     return dataclasses.replace(stage, expected=errors_by_noise(validation, models))
 
 

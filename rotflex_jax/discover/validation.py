@@ -252,6 +252,13 @@ class ValidationSet:
         mechanism = reduced.mechanism.with_values(h.values(s)[recording, reduced.parameters])
         return Model(mechanism, self.problem.predictor.solver, tuple(gates[list(reduced.effects)]))
 
+    def models_as_trained(
+        self, found: "ValidatedHypothesis", locations: Iterable[EffectLocation]
+    ) -> list[Model]:
+        """The model of each recording with some effects on and with the mean calibrations of training."""
+        h, on = found.with_trained_calibrations(self.problem.supermodel), frozenset(locations)
+        return [self.model_of(h, on, i) for i in range(len(self.problem.dataset.recordings))]
+
     @functools.cached_property
     def short_runs(self) -> ShortRuns:
         """Free runs over short windows."""

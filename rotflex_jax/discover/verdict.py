@@ -66,14 +66,14 @@ class Assessment:
     expected: dict[str, float] = dataclasses.field(default_factory=dict)
 
     @property
-    def _over_expected(self) -> dict[str, float]:
-        """Channel -> error that remains, in multiples of what noise alone causes."""
-        return {c: times / max(1.0, self.expected.get(c, 1.0)) for c, times in self.remaining.items()}
+    def limits(self) -> dict[str, float]:
+        """Channel -> error from which on more than noise remains, in multiples of the sensor noise."""
+        return {c: NEAR_FLOOR * max(1.0, self.expected.get(c, 1.0)) for c in self.remaining}
 
     @property
     def at_noise(self) -> bool:
         """Whether the errors of all channels have reached what noise causes."""
-        return all(times < NEAR_FLOOR for times in self._over_expected.values())
+        return all(times < self.limits[c] for c, times in self.remaining.items())
 
     @property
     def torque_free(self) -> bool:
@@ -92,7 +92,7 @@ class Assessment:
         It is the largest of these ratios: square of the error of short free runs in a channel over its limit,
         and gain of random torques over its limit. The limits are those of the verdict.
         """
-        shares = [(times / NEAR_FLOOR) ** 2 for times in self._over_expected.values()]
+        shares = [(times / self.limits[c]) ** 2 for c, times in self.remaining.items()]
         shares.append(self.torque_nats / TORQUE_NATS)
         return math.inf if any(map(math.isnan, shares)) else max(1.0, *shares)
 
@@ -108,13 +108,12 @@ class Assessment:
         runs = f"free runs over {self.seconds:g} s" if self.seconds else "short free runs"
         unknown = [c for c, times in self.remaining.items() if math.isnan(times)]
         if not self.at_noise:
-            if all(times < NEAR_FLOOR for c, times in self.remaining.items() if c not in unknown):
+            if all(times < self.limits[c] for c, times in self.remaining.items() if c not in unknown):
                 return (
                     f"the sensor noise of {' and '.join(unknown)} is not known, to compare what is left with"
                 )
             times = in_noise(self.remaining)
-            limits = {c: NEAR_FLOOR * max(1.0, times) for c, times in self.expected.items()}
-            limit = in_noise(limits) if limits else f"{NEAR_FLOOR:g}"
+            limit = in_noise(self.limits) if self.expected else f"{NEAR_FLOOR:g}"
             return f"errors of {runs} are {times} times the sensor noise (limit {limit})"
         within = f"errors of {runs} are within {NEAR_FLOOR:g} times {self._noise_alone}"
         if not self.torque_free:

@@ -9,7 +9,7 @@ from matplotlib.patheffects import withStroke
 from matplotlib.ticker import LogLocator
 
 from rotflex_jax.discover.probabilities import LEAST_NAMED, parts, set_labels
-from rotflex_jax.discover.result import NEAR_FLOOR, SearchResult
+from rotflex_jax.discover.result import SearchResult
 from rotflex_jax.discover.tables import Outcome, channel_units, noise_ratios, outcomes, stage_labels
 from rotflex_jax.effects.labels import effect_label
 from rotflex_jax.parameters import HALF_WIDTH_95, Estimate
@@ -120,10 +120,8 @@ def ranking(discovery: SearchResult) -> Figure | None:
 
 
 def _staircase_caption(discovery: SearchResult) -> str:
-    by_noise = discovery.assessment.expected
-    reached = [
-        c for c, r in noise_ratios(discovery).items() if r < NEAR_FLOOR * max(1.0, by_noise.get(c, 1.0))
-    ]
+    limits = discovery.assessment.limits
+    reached = [c for c, r in noise_ratios(discovery).items() if r < limits[c]]
     end = (
         f"The error of {' and '.join(reached)} ends at what the noise of the sensor causes."
         if reached
